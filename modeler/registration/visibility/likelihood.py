@@ -29,7 +29,7 @@ _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).a
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
 _SIGNIFICANT = 2.0  # standard errors above which errors near silhouettes are part of the model
 _TAIL = 0.01  # probability of rejecting a true pose by eq. 22
-_MISFIT = 0.5  # mean of r² / 2τ² if variances are right
+MISFIT = 0.5  # mean of r² / 2τ² if variances are right
 
 
 class Scores(NamedTuple):
@@ -157,7 +157,7 @@ class DirectedLikelihood:
             )
         return self._projections[stride]
 
-    def parameters(self, blur_m: float, typical_misfit: float = _MISFIT) -> LikelihoodParameters:
+    def parameters(self, blur_m: float, typical_misfit: float = MISFIT) -> LikelihoodParameters:
         """Return the parameters of the kernel for surfaces with a blur, see method.md, eq. 4 to 6 and 21."""
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
@@ -265,7 +265,7 @@ class PairLikelihood:
         """
         return 1.0 / (1.0 / self.forward.model.max_independent + 1.0 / self.patches) / self.points
 
-    def scores(self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = _MISFIT) -> Scores:
+    def scores(self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = MISFIT) -> Scores:
         """Return the scores of poses.
 
         Args:
@@ -298,7 +298,7 @@ class PairLikelihood:
         one = np.zeros(len(poses), dtype=np.int32)
         return visibility.log_likelihoods(rows(poses), one, [sides], device).astype(float)
 
-    def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = _MISFIT, stride: int = 1) -> Array:
+    def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = MISFIT, stride: int = 1) -> Array:
         """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
 
         Args:
@@ -324,7 +324,7 @@ class PairLikelihood:
         if self.colour is None:
             return MatchNoise(surface_m)
         band = self.colour.band(surface_m)
-        found = self._summed(pose[None], surface_m, band, stride=1, typical_misfit=_MISFIT)
+        found = self._summed(pose[None], surface_m, band, stride=1, typical_misfit=MISFIT)
         return MatchNoise(surface_m, float(correlations(found)[0]), band)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
@@ -340,7 +340,7 @@ class PairLikelihood:
             ]
         )
         if len(misfits) <= _MIN_MATCHES:
-            return _MISFIT
+            return MISFIT
         hidden = self.forward.model.hidden_share
         low, high = 0.0, 2.0
         for _ in range(16):  # bisection: the mean grows with μ
@@ -440,7 +440,7 @@ class PairLikelihood:
         band, weight = 0, 0.0
         if self.colour is not None:
             band = self.colour.scored_band(blur_m)
-            found = self._summed(poses[:1], blur_m, band, stride=1, typical_misfit=_MISFIT)
+            found = self._summed(poses[:1], blur_m, band, stride=1, typical_misfit=MISFIT)
             most = self.forward.model.max_independent_colours
             weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
         colours = self._colours(band, stride)

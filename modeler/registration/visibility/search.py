@@ -12,7 +12,7 @@ from modeler.features import FeatureMatcher
 from modeler.kernels import mixture
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
-from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.likelihood import MISFIT, PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 _STRIDE = 2  # every second point is used for scores
@@ -139,6 +139,9 @@ class Search:
         outside = poses[~inside]
         poses, part = (poses[inside], part[inside]) if inside.any() else (started, part)
         blur_m, misfit = self._nuisance(pair, poses)
+        open_rotation = any(_is_open(prior) for prior in priors)
+        if open_rotation:  # under most motions the views have nothing in common: matches are evidence
+            misfit = MISFIT
         likelihoods = pair.tempered(poses, blur_m, typical_misfit=misfit, stride=_STRIDE)
         # One alternative may be far denser than another, so that the likelihood alone does not rank modes.
         scores = likelihoods + density.log_evidence(poses) if len(parts) > 1 else likelihoods
@@ -148,7 +151,7 @@ class Search:
         poses, part = poses[order], part[order]
         precisions = np.array([np.linalg.inv(prior.covariance) for prior in priors], dtype=np.float64)[part]
         spreads = _spreads(pair, precisions, poses, blur_m)
-        found = Candidates(poses, scores[order], spreads, any(_is_open(prior) for prior in priors))
+        found = Candidates(poses, scores[order], spreads, open_rotation)
         if pair.overlap(found.poses[0]) > min_overlap:
             outside = self._near_support(pair, priors[-1], density, outside)
         found = found.distinct(pair.centre_m)
