@@ -1,5 +1,6 @@
 """Compiled functions: arrays in, arrays out; no package types, no hidden randomness."""
 
+import hashlib
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,15 +16,24 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def drop_stale(folder: Path) -> None:
-    """Delete the compiled kernels of a folder that are older than any source file there.
+    """Delete the compiled kernels of a folder if its source files are not those that they were compiled from.
 
-    Numba keeps a kernel while its own file is unchanged, although it contains functions inlined from other files.
+    Numba keeps a kernel while its own file is unchanged, although it contains functions inlined from other files. Dates
+    do not tell: a file copied with its date may be older than the kernels that it changes.
     """
-    newest = max(path.stat().st_mtime for path in folder.glob("*.py"))
-    for index in (folder / "__pycache__").glob("*.nbi"):
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    compiled_from = folder / "__pycache__" / "kernels.sha256"
+    with suppress(OSError):
+        if compiled_from.read_text() == digest.hexdigest():
+            return
+    for index in compiled_from.parent.glob("*.nbi"):
         with suppress(OSError):  # another process was faster, or no permission
-            if index.stat().st_mtime < newest:
-                index.unlink()
+            index.unlink()
+    with suppress(OSError):
+        compiled_from.parent.mkdir(exist_ok=True)
+        compiled_from.write_text(digest.hexdigest())
 
 
 def compiled(module: str, name: str) -> bool:
