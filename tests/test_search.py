@@ -138,14 +138,17 @@ def test_a_small_part_that_alone_determines_the_spin_is_not_blurred_away():
         assert min(rotation_error_deg(pose, right) for pose in found.poses) < 10.0
 
 
+def observed(camera, shape, condition):
+    """Source and target of a shape before a depth camera, the true motion, and its density under the table prior."""
+    sequence = RenderedSequence(staged(load_specimen(shape), condition, frames=2, seed=1))
+    target, source = viewed(shown(sequence, CAMERAS[camera], np.random.default_rng(1), seed=1), "true")
+    truth = true_motion(sequence.truth(), target.index, source.index)
+    return source, target, truth, TablePrior().between(source, target)
+
+
 def test_noise_leaves_more_than_one_spin_of_a_body_of_revolution():
     """With the noise of a D435, the spins of a soup plate differ by chance, in which the true one may lose."""
-    sequence = RenderedSequence(
-        staged(load_specimen("soup_plate"), Condition(distance_m=0.7, step_deg=25.0), frames=2, seed=1)
-    )
-    frames = shown(sequence, CAMERAS["D435"], np.random.default_rng(1), seed=1)
-    target, source = viewed(frames, "true")
-    right, density = true_motion(sequence.truth(), target.index, source.index), TablePrior().between(source, target)
+    source, target, right, density = observed("D435", "soup_plate", Condition(distance_m=0.7, step_deg=25.0))
     for seed in range(3):
         rng = np.random.default_rng(seed)
         found = Search().run(VisibilityLikelihood().between(source, target, rng), density, rng, min_overlap=MIN_OVERLAP)
@@ -156,12 +159,7 @@ def test_noise_leaves_more_than_one_spin_of_a_body_of_revolution():
 
 def test_a_six_fold_shape_may_have_turned_farther():
     """40° on and 20° back look alike, but for what the object and the laser's shadows hide of 40°."""
-    sequence = RenderedSequence(
-        staged(load_specimen("gear_wheel"), Condition(distance_m=0.6, step_deg=40.0), frames=2, seed=1)
-    )
-    frames = shown(sequence, CAMERAS["laser stripe"], np.random.default_rng(1), seed=1)
-    target, source = viewed(frames, "true")
-    right, density = true_motion(sequence.truth(), target.index, source.index), TablePrior().between(source, target)
+    source, target, right, density = observed("laser stripe", "gear_wheel", Condition(distance_m=0.6, step_deg=40.0))
     for seed in range(3):
         found = VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(seed))
         shares = [mode.weight for mode in found.modes if rotation_error_deg(mode.pose.mean, right) < 3.0]

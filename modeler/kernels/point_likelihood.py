@@ -33,11 +33,10 @@ MIN_AGREEMENT = np.float32(0.8)
 """Least cosine between the normals of a point and of the surface that it matches."""
 MAX_SIGMAS = np.float32(3.0)
 """Largest distance of a match from the surface in standard deviations."""
-HIDDEN_SIGMAS = np.float32(6.0)
-"""Distance behind the surface in standard deviations from which on a point is hidden, and no inexact match."""
-
 LOOSE_SIGMAS = 4.0
 """The same for `classify`: possible noise is not counted as a contradiction."""
+HIDDEN_SIGMAS = np.float32(6.0)
+"""Distance behind the surface in standard deviations from which on a point is hidden, and no inexact match."""
 
 # Nodes of the table of log((1 - hidden) exp(match) + hidden); below the first it is log(hidden) within 3e-6.
 TABLE_LOW, TABLE_HIGH, TABLE_STEPS = np.float32(-14.0), np.float32(4.0), 2304

@@ -68,8 +68,8 @@ class VisibilityLikelihood:
     """Least error of local planes on a curved surface, as a fraction of the object's size."""
     hidden_share: float = 0.5
     """Prior probability η that a point that faces the other camera is hidden by another part of the object."""
-    missing_share: float = 0.5
-    """Prior probability that surface that faces the camera is not measured; 1 = holes are no evidence."""
+    holes: bool = True
+    """Whether points that should be seen where nothing was measured are evidence (method.md, eq. 6)."""
     max_point_cost: float = 10.0
     """Upper bound K (nats) of the cost of one point."""
     normal_cost: float = 2.0
@@ -161,13 +161,14 @@ class DirectedLikelihood:
         """Return the parameters of the kernel for surfaces with a blur, see method.md, eq. 4 to 6 and 21."""
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
+        missing = max(self.model.hidden_share, 1.0 - self.image.measured_share) if self.model.holes else 1.0
         return LikelihoodParameters(
             blur_m=np.float32(np.hypot(blur_m, self._min_blur_m)),
             silhouette_px=np.float32(_SILHOUETTE_NOISE * lateral_px + blur_m * fx / self._distance_m),
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
             max_point_cost=np.float32(self.model.max_point_cost),
             normal_cost=np.float32(self.model.normal_cost),
-            unmeasured_gain=np.float32(np.log(max(self.model.missing_share, 1.0 - self.image.measured_share))),
+            unmeasured_gain=np.float32(np.log(missing)),
             typical_misfit=np.float32(typical_misfit),
             support=self._support(blur_m),
             table=_match_table(self.model.hidden_share),
@@ -367,12 +368,11 @@ class PairLikelihood:
         """Return the pair with this standard deviation of depth errors near silhouettes in m (eq. 31)."""
         if rim_m == self.forward.rim_m == self.backward.rim_m:
             return self  # with its cached projections
-        forward, backward = (replace(side, rim_m=rim_m) for side in (self.forward, self.backward))
-        return replace(self, forward=forward, backward=backward)
+        return replace(self, forward=replace(self.forward, rim_m=rim_m), backward=replace(self.backward, rim_m=rim_m))
 
     def without_holes(self) -> PairLikelihood:
-        """Return the pair for which surface that should be seen where nothing was measured is no evidence."""
-        model = replace(self.forward.model, missing_share=1.0)
+        """Return the pair for which points that should be seen where nothing was measured are no evidence."""
+        model = replace(self.forward.model, holes=False)
         return replace(self, forward=replace(self.forward, model=model), backward=replace(self.backward, model=model))
 
     def overlap(self, target_from_source: Array) -> float:

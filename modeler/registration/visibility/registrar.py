@@ -220,10 +220,10 @@ def comparable(modes: list[ModeSamples], pair: PairLikelihood) -> list[WeightedS
     if len(modes) == 1:
         return [modes[0].samples]
     reference = min(modes, key=lambda mode: mode.noise_m)
-    compared, gains = pair.without_holes(), []
+    without_holes, gains = pair.without_holes(), []
     for mode in modes:
         best = mode.samples.poses[[np.argmax(mode.samples.log_likelihoods)]]
-        common = compared.tempered(best, reference.noise_m, typical_misfit=reference.typical_misfit)
+        common = without_holes.tempered(best, reference.noise_m, typical_misfit=reference.typical_misfit)
         gains.append(float((common - pair.tempered(best, mode.noise_m, typical_misfit=mode.typical_misfit))[0]))
     of_reference = gains[modes.index(reference)]
     return [

@@ -138,10 +138,8 @@ class Search:
         inside = np.isfinite(density.log_evidence(poses))
         outside = poses[~inside]
         poses, part = (poses[inside], part[inside]) if inside.any() else (started, part)
-        blur_m, misfit = self._nuisance(pair, poses)
         open_rotation = any(_is_open(prior) for prior in priors)
-        if open_rotation:  # under most motions the views have nothing in common: matches are evidence
-            misfit = MISFIT
+        blur_m, misfit = self._nuisance(pair, poses, open_rotation=open_rotation)
         likelihoods = pair.tempered(poses, blur_m, typical_misfit=misfit, stride=_STRIDE)
         # One alternative may be far denser than another, so that the likelihood alone does not rank modes.
         scores = likelihoods + density.log_evidence(poses) if len(parts) > 1 else likelihoods
@@ -194,16 +192,17 @@ class Search:
             remaining &= np.linalg.norm(distances, axis=1) > 1.0
         return motions[kept]
 
-    def _nuisance(self, pair: PairLikelihood, poses: Array) -> tuple[float, float]:
+    def _nuisance(self, pair: PairLikelihood, poses: Array, *, open_rotation: bool) -> tuple[float, float]:
         """Return the noise b in m and the misfit μ of a typical match at the best of some poses (n, 4, 4).
 
         b is at least the smallest blur. With less noise, likelihoods of poses that fit equally well would differ by
-        chance, and with a larger misfit by their numbers of matches, so that all but one would be dropped.
+        chance, and with a larger misfit by their numbers of matches, so that all but one would be dropped. If the
+        rotation is open, the views have nothing in common under most motions: matches are evidence, as with μ = ½.
         """
         fine_m = self.fine_m(pair)
         best = poses[np.argmax(pair.tempered(poses, fine_m, stride=_COARSE_STRIDE))]
         blur_m = max(pair.noises_m(best, fine_m)[0], fine_m)
-        return blur_m, pair.typical_misfit(best, blur_m)
+        return blur_m, MISFIT if open_rotation else pair.typical_misfit(best, blur_m)
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
         """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
