@@ -150,7 +150,7 @@ class Sensor:
 
     def _smoothing(
         self, frame: Frame, measured: BoolArray, outline: BoolArray
-    ) -> tuple[tuple[float, int, int], float, tuple[float, float]]:
+    ) -> tuple[planes.Ball, float, tuple[float, float]]:
         """Return how an object is smoothed (method.md, eq. 1 and 2).
 
         Args:
@@ -159,13 +159,12 @@ class Sensor:
             outline: (h, w) all its pixels.
 
         Returns:
-            Radius of the ball in m, in px at the nearest point, and the stride between its pixels; the least standard
-            deviation of inverse depth (1/m); and the number of measured pixels that share the noise of one, with the
-            area in px over which errors are alike.
+            The ball; the least standard deviation of inverse depth (1/m); and the number of measured pixels that share
+            the noise of one, with the area in px over which errors are alike.
         """
         rows, columns = _places(measured)
         if rows.size == 0:  # nothing to smooth
-            return (0.0, 1, 1), 0.0, (1.0, 1.0)
+            return planes.Ball(0.0, 1, 1, 0.0), 0.0, (1.0, 1.0)
         depth_m = frame.depth_m[rows, columns]
         nearest_m, middle_m = (float(value) for value in np.percentile(depth_m, [2, 50]))
         metres_per_px = middle_m / frame.camera.fx
@@ -173,12 +172,14 @@ class Sensor:
         density = rows.size / float(outline.sum())
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
         # method.md, eq. 1; no more noise than stated, as unevenness of planes adds to theirs
-        noise_m = min(self.pixel_sigma_inverse_per_m * middle_m**2, self.sigma_r_m)
+        known = math.isfinite(self.pixel_sigma_inverse_per_m)
+        pixel_m = self.pixel_sigma_inverse_per_m * middle_m**2 if known else self.sigma_r_m
+        noise_m = min(pixel_m, self.sigma_r_m)
         radius_m = max(self.smoothing * np.sqrt(noise_m * extent_m), sparse_px * metres_per_px)
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, max(16, np.ceil(1.2 * sparse_px))))
         # A stride of 2 px is enough where a wide window holds many pixels.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
-        ball = (radius_m, reach_px, 2 if reach_px > 4 and enough else 1)
+        ball = planes.Ball(radius_m, reach_px, 2 if reach_px > 4 and enough else 1, pixel_m)
         # method.md, eq. 23
         ball_px = np.pi * (radius_m / metres_per_px) ** 2
         sharing = max(density * (ball_px + _ALIKE * self.noise_area_px), 1.0)

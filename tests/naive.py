@@ -97,16 +97,21 @@ def visibility(pose, projection, parameters):
     return total, explained
 
 
-def local_plane(depth_m, mask, intrinsics, pixel, radius_m):
+def local_plane(depth_m, mask, intrinsics, pixel, ball):
     """Plane N (3,) with N · p = 1 through a pixel's neighbours in a ball, by least squares in inverse depth."""
     fx, fy, cx, cy = intrinsics
     rows, columns = np.nonzero(mask & (depth_m > 0))
     z = depth_m[rows, columns]
-    points = np.stack([z * (columns - cx) / fx, z * (rows - cy) / fy, z], axis=1)
+    padded = np.pad(np.where(mask & (depth_m > 0), depth_m, np.nan), 1, constant_values=np.nan)
+    around = np.stack([padded[rows + down, columns + across] for down in range(3) for across in range(3)])
+    paired = np.isfinite(around) & np.isfinite(around[::-1])  # with the opposite neighbour
+    outlier_m = 3.0 * ball.noise_m
+    filtered = np.median(np.where(paired, around, z), axis=0) if outlier_m > ball.radius_m else z
+    rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(len(z))], axis=1)
+    points = filtered[:, None] * rays
     centre = points[(rows == pixel[0]) & (columns == pixel[1])][0]
-    near = np.linalg.norm(points - centre, axis=1) <= radius_m
-    rays = points[near] / points[near, 2:]
-    solution, *_ = np.linalg.lstsq(rays, 1 / points[near, 2], rcond=None)
+    near = (np.linalg.norm(points - centre, axis=1) <= ball.radius_m) & (np.abs(z - filtered) <= outlier_m)
+    solution, *_ = np.linalg.lstsq(rays[near], 1 / z[near], rcond=None)
     return solution
 
 

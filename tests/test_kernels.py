@@ -200,18 +200,19 @@ def test_the_class_of_a_point_follows_from_where_it_lies():
     assert classes.tolist() == [want for *_, want in cases]
 
 
-def test_local_planes_are_least_squares_in_inverse_depth(rng):
+@pytest.mark.parametrize("noise_m", [0.01, 0.031])
+def test_local_planes_are_least_squares_in_inverse_depth(rng, noise_m):
     depth_m = 0.8 + 0.05 * rng.random(SHAPE)
     depth_m[rng.random(SHAPE) < 0.1] = np.nan
     mask = np.zeros(SHAPE, dtype=bool)
     mask[2:14, 3:17] = True
-    radius_m, edge_px = 0.09, rng.random(SHAPE).astype(np.float32)
-    cells = planes.local_planes(depth_m.astype(np.float32), mask, edge_px, INTRINSICS, (radius_m, 4, 1), 1e-6)
+    ball, edge_px = planes.Ball(0.09, 4, 1, noise_m), rng.random(SHAPE).astype(np.float32)
+    cells = planes.local_planes(depth_m.astype(np.float32), mask, edge_px, INTRINSICS, ball, 1e-6)
     fitted = np.argwhere(cells[..., planes.VARIANCE] > 0)
     assert len(fitted) > 60
     np.testing.assert_array_equal(cells[..., planes.SILHOUETTE], edge_px)
     for pixel in fitted[::5]:
-        want = naive.local_plane(np.where(mask, depth_m, 0).astype(np.float32), mask, INTRINSICS, pixel, radius_m)
+        want = naive.local_plane(np.where(mask, depth_m, 0).astype(np.float32), mask, INTRINSICS, pixel, ball)
         got = -cells[(*pixel, slice(0, 3))] / cells[(*pixel, planes.DISTANCE)]
         np.testing.assert_allclose(got, want, rtol=2e-3, atol=2e-4)
 
@@ -223,11 +224,30 @@ def test_a_noise_free_plane_is_found_whatever_its_tilt():
     depth_m = 1 / (plane[0] * w[None, :] + plane[1] * w[:, None] + plane[2])
     mask, edge_px = np.ones((64, 64), dtype=bool), np.zeros((64, 64), dtype=np.float32)
     intrinsics = np.array([100.0, 100.0, 31.5, 31.5])
-    cells = planes.local_planes(depth_m.astype(np.float32), mask, edge_px, intrinsics, (0.04, 6, 2), 1e-6)
+    cells = planes.local_planes(
+        depth_m.astype(np.float32), mask, edge_px, intrinsics, planes.Ball(0.04, 6, 2, 0.0), 1e-6
+    )
     inner = cells[20:44, 20:44]
     assert (inner[..., planes.KIND] == planes.SURFACE).all()
     got = -inner[..., :3] / inner[..., planes.DISTANCE, None]
     np.testing.assert_allclose(got, np.broadcast_to(plane, (24, 24, 3)), atol=1e-3)
+
+
+def test_noise_as_large_as_the_ball_does_not_flatten_slopes(rng):
+    """A pixel's neighbours are those around its surface, not those that err as it does."""
+    size, focal_px, distance_m, sigma_m = 96, 500.0, 1.0, 0.004
+    ball = planes.Ball(0.006, 5, 1, sigma_m)  # 28 px
+    w = (np.arange(size) - 47.5) / focal_px
+    plane = np.array([0.8, 0.0, 1.0]) / distance_m
+    inverse = plane[0] * w[None, :] + plane[2] + rng.normal(0.0, sigma_m / distance_m**2, (size, size))
+    mask, edge_px = np.ones((size, size), dtype=bool), np.zeros((size, size), dtype=np.float32)
+    intrinsics = np.array([focal_px, focal_px, 47.5, 47.5])
+    cells = planes.local_planes((1.0 / inverse).astype(np.float32), mask, edge_px, intrinsics, ball, 1e-6)
+    inner = cells[8:-8, 8:-8].reshape(-1, planes.CELL_SIZE)
+    inner = inner[inner[:, planes.KIND] == planes.SURFACE].astype(np.float64)
+    assert len(inner) > 0.9 * (size - 16) ** 2
+    slopes = -inner[:, planes.NORMAL_X] / inner[:, planes.DISTANCE]
+    assert 0.8 * plane[0] < slopes.mean() < 1.05 * plane[0]  # 0.3 with balls around measured points
 
 
 def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):

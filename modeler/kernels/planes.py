@@ -1,6 +1,7 @@
 """Local planes of a depth image, and the distance from the object's silhouette."""
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -17,10 +18,24 @@ SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
 RIM = 7  # of a pixel of the object, in the same place: weight of errors near its silhouette (method.md, eq. 31)
 CELL_SIZE = 8
 
-_NOWHERE_M = 1e9  # outside every ball
+_OUTLIER = 3.0  # standard deviations of a pixel's noise, by convention
+
 _APART = 32  # of every so many rows, each thread processes some
 # RAGGED: object without a reliable plane, or an occluder.
 MISSING, SURFACE, RAGGED, BACKGROUND = 0.0, 1.0, 2.0, 3.0
+
+
+class Ball(NamedTuple):
+    """The neighbourhood of a pixel."""
+
+    radius_m: float
+    """Radius in m."""
+    reach_px: int
+    """Half-width in px of a window that contains it."""
+    stride: int
+    """Between the pixels that are read."""
+    noise_m: float
+    """Standard deviation in m of the depth of a pixel."""
 
 
 @numba.njit(cache=True)
@@ -62,19 +77,82 @@ def bounds(mask):
 
 
 @numba.njit(cache=True)
-def padded(depth_m, mask, intrinsics, window, pad):
-    """Return x, y, z in m and 1/z in 1/m (4, h, w) of a mask's pixels in a padded window; others are far away."""
+def padded(depth_m, mask, intrinsics, window, ball):
+    """Return positions and inverse depths of a mask's pixels in a padded window; NaN elsewhere.
+
+    Positions decide which pixels a ball holds. If pixels err by as much as its radius, a measured position keeps only
+    neighbours that err alike, which flattens slopes and averages nothing. Then positions are those of a median filter
+    of 3×3 px, and outliers have none. Inverse depths, to which planes are fitted, are those measured.
+
+    Args:
+        depth_m: (h, w) z in m.
+        mask: (h, w) bool.
+        intrinsics: (4,) fx, fy, cx, cy in px.
+        window: top, bottom, left and right of the pixels.
+        ball: of the neighbourhoods; the window is padded by its reach.
+
+    Returns:
+        (4, h, w) float32 x, y, z in m, and measured 1/z in 1/m.
+    """
     top, bottom, left, right = window
     fx, fy, cx, cy = intrinsics
-    points = np.full((4, bottom - top + 2 * pad, right - left + 2 * pad), _NOWHERE_M, dtype=np.float32)
+    pad, outlier_m = ball.reach_px, _OUTLIER * ball.noise_m
+    is_noisy = outlier_m > ball.radius_m
+    height, width = bottom - top + 2 * pad, right - left + 2 * pad
+    measured_m = np.full((height, width), np.nan, dtype=np.float32)
     for row in range(top, bottom):
         for column in range(left, right):
             z = depth_m[row, column]
             if mask[row, column] and z > 0.0:
-                r, c = row - top + pad, column - left + pad
+                measured_m[row - top + pad, column - left + pad] = z
+    points = np.full((4, height, width), np.nan, dtype=np.float32)  # outside every ball
+    for r in range(pad, height - pad):
+        for c in range(pad, width - pad):
+            measured = measured_m[r, c]
+            if not measured > 0.0:
+                continue
+            z = median_around(measured_m, r, c) if is_noisy else measured
+            if abs(measured - z) <= outlier_m:
+                row, column = r - pad + top, c - pad + left
                 points[0, r, c], points[1, r, c] = z * (column - cx) / fx, z * (row - cy) / fy
-                points[2, r, c], points[3, r, c] = z, 1.0 / z
+                points[2, r, c], points[3, r, c] = z, 1.0 / measured
     return points
+
+
+@numba.njit(cache=True)
+def median_around(depth_m, row, column):
+    """Return the median of the 3×3 depths about a pixel.
+
+    Opposite neighbours count as the pixel itself if one of them has no depth, so that a slope keeps its depth up to its
+    border.
+    """
+    z = depth_m[row, column]
+    a, b = opposite(depth_m[row - 1, column - 1], depth_m[row + 1, column + 1], z)
+    c, d = opposite(depth_m[row - 1, column], depth_m[row + 1, column], z)
+    e, f = opposite(depth_m[row - 1, column + 1], depth_m[row + 1, column - 1], z)
+    g, h = opposite(depth_m[row, column - 1], depth_m[row, column + 1], z)
+    # Of three sorted triples, it is the median of the largest minimum, the median of medians and the least maximum.
+    low_1, middle_1, high_1 = ascending(a, b, c)
+    low_2, middle_2, high_2 = ascending(d, e, f)
+    low_3, middle_3, high_3 = ascending(g, h, z)
+    _, middle, _ = ascending(middle_1, middle_2, middle_3)
+    lowest, highest = max(low_1, low_2, low_3), min(high_1, high_2, high_3)
+    return ascending(lowest, middle, highest)[1]
+
+
+@numba.njit(cache=True)
+def opposite(a, b, instead):
+    """Return two depths, or twice the one instead if either is missing."""
+    there = a > 0.0 and b > 0.0  # not NaN
+    return a if there else instead, b if there else instead
+
+
+@numba.njit(cache=True)
+def ascending(a, b, c):
+    """Return three numbers in ascending order."""
+    a, b = min(a, b), max(a, b)
+    b, c = min(b, c), max(b, c)
+    return min(a, b), max(a, b), c
 
 
 @numba.njit(cache=True, fastmath={"contract", "nsz"})
@@ -125,7 +203,7 @@ def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse_per_
         mask: (h, w) bool, object.
         silhouette: (h, w) copied into the cells: `silhouette_distance` outside the object, `rim_weights` on it.
         intrinsics: (4,) fx, fy, cx, cy in px.
-        ball: radius in m; half-width of its window in px; stride between the pixels that are read.
+        ball: around each pixel.
         sigma_inverse_per_m: sensor noise of 1/z, in 1/m.
         measured: (h, w) bool, the object pixels to which planes are fitted; the depth of others only determines where
             to look for neighbours. None: all.
@@ -134,8 +212,8 @@ def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse_per_
         (h, w, 8) float32 cells, columns as above.
     """
     window = bounds(mask)
-    centres = padded(depth_m, mask, intrinsics, window, ball[1])
-    points = centres if measured is None else padded(depth_m, measured, intrinsics, window, ball[1])
+    centres = padded(depth_m, mask, intrinsics, window, ball)
+    points = centres if measured is None else padded(depth_m, measured, intrinsics, window, ball)
     images = depth_m, mask, silhouette, centres, points
     cells = np.empty((*depth_m.shape, CELL_SIZE), dtype=np.float32)
     apart = np.argsort(np.arange(len(cells)) % _APART, kind="stable")  # every thread gets its share of the object
@@ -149,7 +227,7 @@ def _local_planes(
 ):
     width = depth_m.shape[1]
     fx, fy, cx, cy = intrinsics
-    radius_m, reach, stride = ball
+    radius_m, reach, stride = ball.radius_m, ball.reach_px, ball.stride
     top, bottom, left, right = window
     line, sums = np.empty((6, right - left), dtype=np.float32), np.empty((10, right - left))
     for row in rows:
