@@ -183,7 +183,7 @@ class AdaptiveSampler:
     mixtures.
     """
 
-    draws: int = 400
+    draws: int = 200
     """Samples per round; regions that the first round misses may also be missed by later ones."""
     samples: int = 300
     """Effective sample size at which the rounds end, and largest number of samples in the result."""
