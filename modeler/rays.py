@@ -210,53 +210,14 @@ def _places(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows + top, columns + left
 
 
-def under_focal_length(view: RayImage, log_factor: float) -> RayImage:
-    """Return a view under another focal length, as `Sensor.refocused`, but without smoothing its surface anew.
-
-    The planes of its pixels follow exactly; which pixels a ball holds would hardly change.
-
-    Args:
-        view: as `Sensor.ray_image` made it.
-        log_factor: logarithm of the other focal length over that of the view.
-    """
-    factor = math.exp(log_factor)
-    cells = view.layers["cells"].copy()
-    surface = cells[..., planes.KIND] == planes.SURFACE
-    on_surface = cells[surface]
-    normals, lengths = _drawn(on_surface[:, : planes.DISTANCE], factor)
-    on_surface[:, : planes.DISTANCE] = normals
-    on_surface[:, planes.DISTANCE] /= lengths
-    on_surface[:, planes.VARIANCE] /= lengths**2
-    cells[surface] = on_surface
-    normals, lengths = _drawn(view.normals, factor)
-    variance_m2 = (view.layers["variance_m2"] / lengths**2).astype(view.layers["variance_m2"].dtype)
-    return replace(
-        view,
-        frame=_drawn_frame(view.frame, factor),
-        plane=view.plane and _drawn_plane(view.plane, factor),
-        points_m=view.points_m / (factor, factor, 1.0),
-        normals=normals,
-        layers={**view.layers, "cells": cells, "variance_m2": variance_m2},
-    )
-
-
 def _drawn_frame(frame: Frame, factor: float) -> Frame:
     """Return the frame whose points have x and y divided by a factor: that of a longer focal length."""
     camera = frame.camera
     return replace(frame, camera=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
 
 
-def _drawn(normals: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit normals (n, 3) of planes whose points have x and y divided by a factor.
-
-    Also the lengths (n,) by which distances from the planes are divided.
-    """
-    drawn = normals * np.array([factor, factor, 1.0], dtype=normals.dtype)
-    lengths = np.linalg.norm(drawn, axis=1)
-    return drawn / lengths[:, None], lengths
-
-
 def _drawn_plane(plane: Plane, factor: float) -> Plane:
     """Return the support plane whose points have x and y divided by a factor."""
-    normals, lengths = _drawn(plane.normal[None], factor)
-    return replace(plane, normal=normals[0], offset_m=float(plane.offset_m / lengths[0]))
+    drawn = plane.normal * (factor, factor, 1.0)
+    length = float(np.linalg.norm(drawn))
+    return replace(plane, normal=drawn / length, offset_m=plane.offset_m / length)

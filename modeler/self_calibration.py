@@ -13,10 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
-import numpy as np
-
-from modeler import se3
-from modeler.graph import MovingGraph, Smoother, estimate_focal_length
+from modeler.graph import MovingGraph, estimate_focal_length
 from modeler.graph.pose_graph import Factor, collapse_modes
 from modeler.priors.proposals import PredictedProposal
 from modeler.rays import Sensor
@@ -27,8 +24,6 @@ Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
 
 _LIMIT_STEPS = 2.0  # steps for which limits hold, as where a run places a view that one step's do not
 _MAX_ROUNDS = 6  # of registering the edges again about the estimate; on captures two to four are enough
-_NODE = 0.05  # of log c, for derivatives: posteriors' own scatter, a twentieth of it, then moves them by some 2 %
-_SAME_MODE = Smoother.outlier_distance  # standard deviations
 
 
 @final
@@ -60,10 +55,11 @@ class FocalCalibrator:
             prior: of the run.
         """
         known, root = prior.relaxed(_LIMIT_STEPS), min(views)
+        unsure = replace(sensor, sigma_focal=self.prior_sigma)  # so that registrations tell how they follow it
         taking_part = [edge for edge in edges if {edge.source, edge.target} <= views.keys() and _counts(edge)]
 
         def estimate_at(centre: float) -> FocalLength:
-            made = _Made(views, sensor, centre)
+            made = _Made(views, unsure, centre)
             found = [self._registered(edge, made, register, known) for edge in taking_part]
             graph = MovingGraph([factor for factor in found if factor is not None], root, {})
             return graph.estimate(self.prior_sigma, -centre)
@@ -87,12 +83,6 @@ class FocalCalibrator:
             foretold = collapse_modes(edge.posterior.under(made.centre))
             return Factor(edge, foretold) if foretold.by_focal.any() else None
         pose = collapse_modes(posterior)
-        # Over a wide interval: the derivatives of registrations are noisier, which makes steps too small.
-        ends = [register(made.view(edge.source, s), made.view(edge.target, s), proposal) for s in (-_NODE, _NODE)]
-        less, more = (se3.log(se3.inverse(pose.mean) @ collapse_modes(end).mean) for end in ends)
-        bend = 0.5 * (less + more)  # far beyond the predicted change if one of them is another mode
-        if all(end.usable for end in ends) and bend @ np.linalg.solve(pose.covariance, bend) <= _SAME_MODE**2:
-            pose = replace(pose, by_focal=(more - less) / (2.0 * _NODE))
         return Factor(edge, pose) if pose.by_focal.any() else None
 
 
@@ -105,14 +95,14 @@ class _Made:
     centre: float
     """log c."""
 
-    def view(self, frame: int, shift: float = 0.0) -> RayImage:
-        """Return a view at the centre, or at a node next to it."""
-        if (frame, shift) not in self._known:
-            self._known[frame, shift] = self.sensor.refocused(self.views[frame], self.centre + shift)
-        return self._known[frame, shift]
+    def view(self, frame: int) -> RayImage:
+        """Return a view at the centre."""
+        if frame not in self._known:
+            self._known[frame] = self.sensor.refocused(self.views[frame], self.centre)
+        return self._known[frame]
 
     @cached_property
-    def _known(self) -> dict[tuple[int, float], RayImage]:
+    def _known(self) -> dict[int, RayImage]:
         return {}
 
 

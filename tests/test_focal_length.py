@@ -16,50 +16,24 @@ from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.fusion import widened
 from modeler.graph import MovingGraph, PoseGraph, estimate_focal_length, solve
 from modeler.graph.focal import RELIEF_ERROR
-from modeler.kernels import planes
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor, under_focal_length
+from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.visibility.focal_length import averaged
-from modeler.registration.visibility.refinement import focal_motion
+from modeler.registration.visibility import VisibilityLikelihood
+from modeler.registration.visibility.focal_length import FocalNuisance
+from modeler.registration.visibility.sampling import AdaptiveSampler, GaussianMixture
 from modeler.types import (
+    AbstractPoseDensity,
     Array,
     Edge,
     FocalLength,
-    Mode,
     ObjectModel,
-    Outcome,
     PoseGaussian,
-    Posterior,
     Solution,
     Step,
 )
 from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence
-
-
-def drawn(points: Array, factor: float) -> Array:
-    """Points (..., 3) as they are measured under a longer focal length."""
-    return points / (factor, factor, 1.0)
-
-
-def distance_m(carried: Array, on_plane: Array, normal: Array, log_factor: float) -> float:
-    """How far a point is behind a plane that it lies on, both measured under a longer focal length, once carried."""
-    factor = np.exp(log_factor)
-    turned = normal * (factor, factor, 1.0)
-    point = se3.transform(se3.inverse(carried), on_plane[None])
-    moved = se3.transform(carried, drawn(point, factor))[0]
-    return float(turned @ (drawn(on_plane, factor) - moved) / np.linalg.norm(turned))
-
-
-def test_distances_of_carried_points_from_planes_follow_the_focal_length(rng: np.random.Generator) -> None:
-    for _ in range(20):
-        carried, step = se3.exp(rng.normal(size=6) * np.repeat([0.5, 0.1], 3)), 1e-5
-        on_plane, normal = rng.normal(size=3) * 0.1 + (0.0, 0.0, 0.8), rng.normal(size=3)
-        normal /= np.linalg.norm(normal)
-        less, more = (distance_m(carried, on_plane, normal, shift) for shift in (-step, step))
-        by_focal = (more - less) / (2.0 * step)
-        np.testing.assert_allclose(focal_motion(carried, on_plane[None])[0] @ normal, by_focal, rtol=1e-6, atol=1e-9)
 
 
 def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
@@ -67,7 +41,7 @@ def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
     sequence, prior, step = open_sequence(bundled("box")), GeneralPrior(), 0.02
     noise = sequence.sensor()
     assert noise is not None
-    sensor = Sensor(*noise)
+    sensor = Sensor(*noise[:3], sigma_focal=step)
     target, source = (sensor.ray_image(sequence.frame(index)) for index in (1, 2))
 
     def registered(log_factor: float, seed: int) -> PoseGaussian:
@@ -85,94 +59,86 @@ def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
     np.testing.assert_allclose(about_centre[:3], wanted[:3], atol=0.3)
 
 
-def test_views_under_another_focal_length_are_those_measured_with_it() -> None:
-    sequence, step = open_sequence(bundled("box")), 0.05
+CENTRE_M, SIGMAS = np.array([0.05, -0.02, 0.7]), np.repeat([0.01, 0.002], 3)
+ABOUT = se3.exp(np.array([0.2, -0.1, 0.3, 0.01, 0.02, -0.03]))
+
+
+class Free(AbstractPoseDensity):
+    """A wide Gaussian about a motion, which proposes and is no evidence."""
+
+    evidence = False
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        return gaussian(ABOUT, 3.0 * SIGMAS).sample(count, rng)
+
+    def log_density(self, target_from_source: Array) -> Array:
+        return gaussian(ABOUT, 3.0 * SIGMAS).log_density(target_from_source)
+
+
+def gaussian(mean: Array, sigmas: Array) -> GaussianMixture:
+    return GaussianMixture(mean[None], np.diag(sigmas)[None], np.zeros(1), CENTRE_M)
+
+
+@pytest.mark.parametrize("bend", [0.0, 20.0])
+def test_the_derivative_is_exact_and_what_it_does_not_tell_widens_the_posterior(
+    bend: float, rng: np.random.Generator
+) -> None:
+    """Although proposals follow the focal length only roughly."""
+    sigma, by_focal = 0.02, rng.normal(size=6) * np.repeat([1.0, 0.2], 3)
+    curved = np.array([bend, 0.0, 0.0, 0.0, 0.0, 0.0])  # rad, per unit squared
+
+    def log_likelihood(poses: Array, log_focal: Array) -> Array:
+        given = poses @ se3.exp(-log_focal[:, None] * by_focal)
+        xi = se3.difference(ABOUT, given, CENTRE_M) - log_focal[:, None] ** 2 * curved
+        return -0.5 * np.sum((xi / SIGMAS) ** 2, axis=1)
+
+    roughly = FocalNuisance(sigma, 0.8 * by_focal)
+    sampler = AdaptiveSampler(samples=4000, max_draws=20000)
+    found = sampler.run(Free(), log_likelihood, CENTRE_M, rng, nuisance=roughly).conditional(CENTRE_M)
+    about_centre = se3.adjoint(se3.translation(-CENTRE_M)) @ (found.nuisance.by_focal - by_focal)
+    np.testing.assert_allclose(sigma * about_centre / SIGMAS, 0.0, atol=0.15)
+    mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)
+    shift = se3.difference(ABOUT, mean, CENTRE_M) - sigma**2 * curved
+    np.testing.assert_allclose(shift / SIGMAS, 0.0, atol=0.15)
+    want = SIGMAS**2 + 2.0 * sigma**4 * curved**2
+    np.testing.assert_allclose(np.diag(covariance) / want, 1.0, atol=0.25)  # with a bend, of 2.3 and of 1
+
+
+def test_a_prior_that_knows_the_motion_keeps_it_under_every_focal_length(rng: np.random.Generator) -> None:
+    class Exact(Free):
+        def log_evidence(self, target_from_source: Array) -> Array:
+            return gaussian(ABOUT, 0.1 * SIGMAS).log_density(target_from_source)
+
+    by_focal = np.array([0.5, 0.0, 0.0, 0.0, 0.1, 0.0])
+
+    def log_likelihood(poses: Array, log_focal: Array) -> Array:
+        return gaussian(ABOUT, SIGMAS).log_density(poses @ se3.exp(-log_focal[:, None] * by_focal))
+
+    found = AdaptiveSampler(samples=1000).run(
+        Exact(), log_likelihood, CENTRE_M, rng, nuisance=FocalNuisance(0.02, by_focal)
+    )
+    about_centre = se3.adjoint(se3.translation(-CENTRE_M)) @ found.conditional(CENTRE_M).nuisance.by_focal
+    np.testing.assert_allclose(0.02 * about_centre / SIGMAS, 0.0, atol=0.15)  # 1 without the prior
+
+
+def test_poses_are_scored_under_a_focal_length_as_views_that_were_made_with_it() -> None:
+    sequence, step = open_sequence(bundled("box")), 0.01
     sensor = Sensor(*(sequence.sensor() or ()))
-    view = sensor.ray_image(sequence.frame(1))
-    want, got = sensor.refocused(view, step), under_focal_length(view, step)
-    assert got.frame.camera == want.frame.camera
-    known, other = ({tuple(pixel): k for k, pixel in enumerate(one.pixels.tolist())} for one in (want, got))
-    shared = sorted(known.keys() & other.keys())
-    assert len(shared) > 0.9 * len(want.pixels)
-    mine, yours = ([numbers[pixel] for pixel in shared] for numbers in (other, known))
-    distances_m = np.sum((got.points_m[mine] - want.points_m[yours]) * want.normals[yours], axis=1)
-    assert np.sqrt(np.mean(distances_m**2)) < 0.1 * sensor.sigma_r_m
-    assert np.median(np.sum(got.normals[mine] * want.normals[yours], axis=1)) > np.cos(np.radians(0.5))
-    for one in (got, under_focal_length(got, -step)):  # points lie on the planes of their pixels
-        cells = one.layers["cells"][one.pixels[:, 0], one.pixels[:, 1]]
-        heights_m = np.sum(cells[:, : planes.DISTANCE] * one.points_m, axis=1) + cells[:, planes.DISTANCE]
-        np.testing.assert_allclose(heights_m, 0.0, atol=1e-6)
-        np.testing.assert_allclose(one.normals, cells[:, : planes.DISTANCE], atol=1e-6)
-    np.testing.assert_allclose(under_focal_length(got, -step).points_m, view.points_m, atol=1e-12)
-
-
-CENTRE_M, FAR = np.array([0.0, 0.0, 0.8]), np.diag(np.repeat([0.1, 0.001], 3) ** 2)
-
-
-def posterior_of(pose: PoseGaussian, seed: int = 0) -> Posterior:
-    """A posterior with samples of a Gaussian, whose moments they have exactly."""
-    drawn = np.random.default_rng(seed).normal(size=(400, 6))
-    white = np.linalg.solve(np.linalg.cholesky(np.cov(drawn.T, bias=True)), (drawn - drawn.mean(axis=0)).T).T
-    samples = pose.mean @ se3.exp(white @ np.linalg.cholesky(pose.covariance).T)
-    weights = np.full(400, 1 / 400)
-    return Posterior(1, 0, pose, Outcome.CONVERGED, overlap=0.8, samples=samples, weights=weights, seconds=0.0)
-
-
-def about_centre(pose: PoseGaussian) -> Array:
-    return se3.covariance_about(pose.covariance, CENTRE_M)
-
-
-def test_of_poses_far_apart_what_their_derivative_does_not_tell_widens_the_posterior(rng: np.random.Generator) -> None:
-    by_focal, bend = rng.normal(size=6), np.array([0.0, 4.0, 0.0, 0.0, 0.0, 0.0])  # per unit, rad
-    pose = PoseGaussian(se3.translation(np.array([0.1, 0.0, 0.0])), se3.covariance_about(FAR, -CENTRE_M), by_focal)
-
-    def under(log_factor: float, bend: Array | float = 0.0) -> Posterior:
-        moved = pose.under(log_factor)
-        return posterior_of(replace(moved, mean=se3.moved(moved.mean, log_factor * bend * np.ones(6), CENTRE_M)))
-
-    found, sigma = posterior_of(pose), 0.02
-    same = averaged(found, under, sigma, CENTRE_M).pose
-    np.testing.assert_allclose(about_centre(same), FAR, rtol=0.02, atol=1e-5)  # to first order in ξ
-    np.testing.assert_array_equal(same.by_focal, by_focal)
-    bent = averaged(found, lambda log_factor: under(log_factor, bend), sigma, CENTRE_M).pose
-    np.testing.assert_allclose(about_centre(bent)[1, 1], FAR[1, 1] + (sigma * bend[1]) ** 2, rtol=0.03)
-    np.testing.assert_allclose(about_centre(bent)[0, 0], FAR[0, 0], rtol=0.03)
-
-
-def test_precise_poses_separate_modes_and_known_focal_lengths_are_not_averaged() -> None:
-    def never(_: float) -> Posterior:
-        raise AssertionError
-
-    far = PoseGaussian(np.eye(4), FAR)
-    apart = tuple(Mode(0.5, replace(far, mean=se3.exp(np.array([angle, 0.0, 0, 0, 0, 0])))) for angle in (0.0, 1.0))
-    for found, sigma in (
-        (posterior_of(replace(far, covariance=0.1 * FAR)), 0.02),
-        (replace(posterior_of(far), modes=apart), 0.02),
-        (replace(posterior_of(far), outcome=Outcome.NO_OVERLAP), 0.02),
-        (posterior_of(far), 0.0),
-    ):
-        assert averaged(found, never, sigma, CENTRE_M) is found
-
-
-@pytest.mark.parametrize(("name", "wider"), [("tube", True), ("box", False)])
-def test_a_body_of_revolution_may_have_turned_under_a_wrong_focal_length(name: str, wider: bool) -> None:
-    """Under it, it is none, and seems not to have turned."""
-    sequence = open_sequence(bundled(name))
-    noise = sequence.sensor()
-    assert noise is not None
-    focal = FocalFactor(0.93, stated_px=sequence.frame(0).camera.fx)
-    frames = [RefocusedSequence(sequence, focal).frame(index) for index in (2, 3)]
-    found = []
-    for sigma_focal in (0.0, 0.04):
-        target, source = (Sensor(*noise[:3], sigma_focal=sigma_focal).ray_image(frame) for frame in frames)
-        density = GeneralPrior().between(source, target)
-        found.append(VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(0)))
-    known, uncertain = (np.sqrt(one.pose.rotation_variance_rad2) for one in found)
-    if wider:
-        assert uncertain > 1.3 * known
-    else:
-        assert uncertain == known
-        np.testing.assert_array_equal(found[0].pose.mean, found[1].pose.mean)
+    source, target = (sensor.ray_image(sequence.frame(index)) for index in (2, 1))
+    truth = sequence.truth()
+    assert truth is not None
+    pose = true_motion(truth, target=1, source=2)[None]
+    model = VisibilityLikelihood(points=5000)
+    pair, other = (
+        model.between(sensor.refocused(source, shift), sensor.refocused(target, shift), np.random.default_rng(0))
+        for shift in (0.0, step)
+    )
+    as_given, under, wanted = (
+        float(one.scores(pose, 0.001, stride=1, log_focal=shift).surface[0])
+        for one, shift in ((pair, None), (pair, np.array([step])), (other, None))
+    )
+    assert abs(as_given - wanted) > 50.0  # nats
+    assert under == pytest.approx(wanted, abs=0.2 * abs(as_given - wanted))
 
 
 def test_inverse_and_composed_motions_follow_as_their_parts_do(rng: np.random.Generator) -> None:

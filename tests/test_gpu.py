@@ -44,7 +44,7 @@ def device(request):
     return request.param
 
 
-def test_visibility_is_that_of_numba_for_poses_of_several_pairs(device):
+def test_visibility_is_that_of_numba_for_poses_of_several_pairs_under_other_focal_lengths(device):
     from modeler.kernels.gpu import visibility
 
     rng = np.random.default_rng(0)
@@ -55,9 +55,10 @@ def test_visibility_is_that_of_numba_for_poses_of_several_pairs(device):
         tried = np.stack([random_pose(rng, 0.3) for _ in range(60)])
         tried = tried[far_from_borders(projections[0], tried) & far_from_borders(projections[1], se3.inverse(tried))]
         assert len(tried) > 20
-        poses.append(rows(tried))
+        under = np.column_stack([rows(tried), np.exp(rng.normal(0.0, 0.001, len(tried)))])  # focal lengths
+        poses.append(under)
         pair_of += [number] * len(tried)
-        want.append(scores.scores(rows(tried), *pairs[-1]))
+        want.append(scores.scores(under, *pairs[-1]))
     mixed = rng.permutation(len(pair_of))
     got = visibility.log_likelihoods(
         np.concatenate(poses)[mixed], np.array(pair_of, dtype=np.int32)[mixed], pairs, gpu.chosen(device, 1) or ""

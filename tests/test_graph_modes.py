@@ -288,7 +288,7 @@ def _off(pose: Array, rng: np.random.Generator) -> Array:
 
 def _registered(density: AbstractPoseDensity, images: Array, rng: np.random.Generator) -> PoseGaussian:
     """The posterior of images that alone would say `images`, with VARIANCE, sampled from `density` on."""
-    found = SAMPLER.run(density, lambda poses: _log_gaussian(poses, images), OBJECT_M, rng)
+    found = SAMPLER.run(density, lambda poses, _: _log_gaussian(poses, images), OBJECT_M, rng)
     return weighted_gaussian(found.poses, found.weights, OBJECT_M)
 
 

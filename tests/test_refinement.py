@@ -16,6 +16,7 @@ from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.likelihood import MatchNoise
 from modeler.registration.visibility.refinement import Refiner, shrunk, visible_share
+from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
 from sequences import bundled, open_sequence
 
@@ -85,12 +86,15 @@ def test_matches_are_near_and_face_alike(rng):
     ).all()
 
 
+def alike(poses):
+    """Samples of equal weight."""
+    return WeightedSamples(poses, np.full(len(poses), 1.0 / len(poses)), np.zeros(len(poses)), 0.0, 0.0)
+
+
 def test_directions_that_the_surface_determines_are_refined(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    mean, turn_rad, shift_m = sigmas_about(
-        Refiner().refine(pair, pair, (poses, np.ones(len(poses))), rng, fine_m=0.001).poses, centre_m
-    )
+    mean, turn_rad, shift_m = sigmas_about(Refiner().refine(pair, pair, alike(poses), rng, fine_m=0.001), centre_m)
     _, turn_before_rad, shift_before_m = sigmas_about(poses, centre_m)
     assert turn_rad < 0.5 * turn_before_rad
     assert shift_m < shift_before_m
@@ -108,7 +112,7 @@ def test_the_roll_of_a_tube_is_not(rng):
     roll = np.concatenate([axis, shift])
     poses = scattered(truth, centre_m, np.repeat([0.003, 0.0003], 3), rng)
     poses = se3.moved(poses, rng.normal(size=(len(poses), 1)) * 0.2 * roll, centre_m)
-    refined = Refiner().refine(pair, pair, (poses, np.ones(len(poses))), rng, fine_m=0.001).poses
+    refined = Refiner().refine(pair, pair, alike(poses), rng, fine_m=0.001)
     xi = se3.difference(truth, refined, centre_m)
     assert np.std(xi[:, :3] @ axis) > 0.12
 
@@ -116,9 +120,8 @@ def test_the_roll_of_a_tube_is_not(rng):
 def test_too_few_matches_leave_the_samples_alone(rng):
     pair, truth, centre_m = bundled_pair("box")
     poses = scattered(truth, centre_m, np.repeat([0.01, 0.001], 3), rng)
-    refined = Refiner(min_matches=10_000.0).refine(pair, pair, (poses, np.ones(len(poses))), rng, fine_m=0.001)
-    np.testing.assert_allclose(refined.poses, poses, atol=1e-9)
-    assert not refined.by_focal.any()
+    refined = Refiner(min_matches=10_000.0).refine(pair, pair, alike(poses), rng, fine_m=0.001)
+    np.testing.assert_allclose(refined, poses, atol=1e-9)
 
 
 @pytest.mark.parametrize("width", [3, 5, 10, 20])

@@ -45,11 +45,11 @@ def spins(count: int, apart_rad: float = 1.0) -> Array:
 def of(pair: PairLikelihood, poses: Array) -> tuple[Array, Array]:
     """Return the log-likelihoods of poses, and those without chance."""
 
-    def plain(some: Array) -> Array:
+    def plain(some: Array, _: Array) -> Array:
         return pair.tempered(some, 0.002)
 
     without = without_chance(pair, poses, plain, blur_m=0.002, typical_misfit=0.5, basin=BASIN)
-    return plain(poses), without(poses)
+    return plain(poses, np.zeros(len(poses))), without(poses, np.zeros(len(poses)))
 
 
 def test_halves_are_parts_of_the_likelihood(tube: PairLikelihood) -> None:

@@ -15,7 +15,8 @@ from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER_RIM, WEIGHT
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor, rim_weights
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
-from modeler.registration.visibility.likelihood import PairLikelihood, nonnegative_solution, significant_variances
+from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.noise import nonnegative_solution, significant_variances
 from modeler.registration.visibility.points import OWN_RIM
 from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
@@ -138,10 +139,8 @@ def test_elimination_is_the_schur_complement(rng: np.random.Generator) -> None:
     """Least squares for ξ and β ~ N(0, 1) together give the same ξ."""
     by_motion, by_nuisance = rng.normal(size=(40, 6)), rng.normal(size=40)
     residuals, weights = rng.normal(size=40), rng.uniform(0.5, 2.0, 40)
-    nothing, zeros = np.zeros(40), np.zeros((40, 6))
-    equations = Equations(
-        zeros[:, :3], by_motion, by_motion, residuals, weights, nothing, nothing, zeros, np.zeros((2, 6, 6))
-    )
+    zeros = np.zeros((40, 6))
+    equations = Equations(zeros[:, :3], by_motion, by_motion, residuals, weights, zeros, np.zeros((2, 6, 6)))
     design = np.column_stack([by_motion, by_nuisance])
     joint = (design.T * weights) @ design + np.diag([0.0] * 6 + [1.0])
     want = np.linalg.solve(joint, -design.T @ (weights * residuals))[:6]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from modeler.registration.visibility.registrar import overlapping
 from modeler.registration.visibility.sampling import (
     AdaptiveSampler,
     GaussianMixture,
+    LogLikelihood,
     MixtureProposal,
     WeightedSamples,
     thinned,
@@ -57,12 +59,19 @@ def away(xi: Array) -> Array:
     return se3.moved(ABOUT, xi, CENTRE_M)
 
 
+def known(log_density: Callable[[Array], Array]) -> LogLikelihood:
+    """A log-likelihood of poses alone, under a focal length that is known."""
+    return lambda poses, _: log_density(poses)
+
+
 @pytest.mark.parametrize("narrower", [1.0, 0.3, 0.05])
 def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
     """However little of the prior the likelihood leaves: mean, covariance and evidence are the product's."""
     shift = narrower * SIGMAS * np.array([1.0, -1.0, 0.5, 0.5, -1.0, 1.0])
     images = gaussian(away(shift), narrower * SIGMAS)
-    found = AdaptiveSampler(samples=6000).run(Around(SIGMAS), images.log_density, CENTRE_M, np.random.default_rng(1))
+    found = AdaptiveSampler(samples=6000).run(
+        Around(SIGMAS), known(images.log_density), CENTRE_M, np.random.default_rng(1)
+    )
     assert found.weights.sum() == pytest.approx(1.0)
     assert found.effective_samples > 3500.0
     mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)
@@ -90,9 +99,9 @@ def test_two_modes_and_a_curved_ridge_keep_their_shares() -> None:
     shares, slopes = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        one = AdaptiveSampler(samples=2000).run(wide, heaps.log_density, CENTRE_M, rng)
+        one = AdaptiveSampler(samples=2000).run(wide, known(heaps.log_density), CENTRE_M, rng)
         shares.append(one.weights[se3.difference(ABOUT, one.poses, CENTRE_M)[:, 0] > 0.0].sum())
-        other = AdaptiveSampler(samples=2000).run(wide, bent, CENTRE_M, rng)
+        other = AdaptiveSampler(samples=2000).run(wide, known(bent), CENTRE_M, rng)
         xi = se3.difference(ABOUT, other.poses, CENTRE_M)
         slopes.append(other.weights @ (xi[:, 4] * xi[:, 0] ** 2) / (other.weights @ xi[:, 0] ** 4))
         assert min(one.effective_samples, other.effective_samples) > 500.0
@@ -104,7 +113,7 @@ def test_a_poor_proposal_costs_samples_and_not_correctness() -> None:
     """What only proposes is divided out: the result is the likelihood's own Gaussian."""
     images = gaussian(away(3.0 * SIGMAS), SIGMAS)
     found = AdaptiveSampler(samples=3000).run(
-        Around(SIGMAS, evidence=False), images.log_density, CENTRE_M, np.random.default_rng(3)
+        Around(SIGMAS, evidence=False), known(images.log_density), CENTRE_M, np.random.default_rng(3)
     )
     mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)
     np.testing.assert_allclose(se3.difference(ABOUT, mean, CENTRE_M) / SIGMAS, 3.0, atol=0.1)
@@ -114,7 +123,7 @@ def test_a_poor_proposal_costs_samples_and_not_correctness() -> None:
 def test_it_draws_no_more_than_it_may_and_states_its_effective_size() -> None:
     narrow = gaussian(away(4.0 * SIGMAS), 0.01 * SIGMAS)
     found = AdaptiveSampler(draws=200, max_draws=400).run(
-        Around(SIGMAS), narrow.log_density, CENTRE_M, np.random.default_rng(0)
+        Around(SIGMAS), known(narrow.log_density), CENTRE_M, np.random.default_rng(0)
     )
     assert len(found.poses) <= 400
     assert found.effective_samples < 100.0
@@ -125,7 +134,7 @@ def test_the_likelihood_is_called_only_inside_the_support_and_an_empty_support_i
         def log_evidence(self, target_from_source: Array) -> Array:
             return np.full(len(target_from_source), -np.inf)
 
-    def never(poses: Array) -> Array:
+    def never(poses: Array, _: Array) -> Array:
         raise AssertionError(f"called with {len(poses)} impossible poses")
 
     found = AdaptiveSampler(max_draws=600).run(

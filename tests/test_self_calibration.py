@@ -21,7 +21,7 @@ from modeler.types import AbstractPrior, Edge, FocalLength, Outcome, Posterior, 
 from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
 
 STEPS = 12
-SENSOR = Sensor(sigma_r_m=1e-3)
+SENSOR = Sensor(sigma_r_m=1e-3, sigma_focal=0.02)
 MODELER = Modeler(sensor=SENSOR)
 
 

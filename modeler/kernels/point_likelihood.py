@@ -86,6 +86,29 @@ def invert(pose, inverse):
             inverse[4 * k + 3] -= pose[4 * m + k] * pose[4 * m + 3]
 
 
+@numba.njit(cache=True, forceinline=True)
+def direct(pose, backward, transform):
+    """Write the rows of the 3×4 matrix that takes points of one view to the other into `transform` (12,).
+
+    Args:
+        pose: (12,) target_from_source; with a 13th number, the factor F of the true focal length over that of both
+            views, whose coordinates x and y are to be divided by it. The transform is then S⁻¹ T S, S = diag(1/F, 1/F,
+            1), from points as they are to points as they are (method.md, eq. 29).
+        backward: whether the points are the target's.
+        transform: out.
+    """
+    if backward:
+        invert(pose, transform)
+    else:
+        for k in range(12):
+            transform[k] = pose[k]
+    if pose.shape[0] > 12:
+        for k in (2, 3, 6, 7):
+            transform[k] *= pose[12]
+        for k in (8, 9):
+            transform[k] /= pose[12]
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def transform_points(pose, projection, transformed, pixels):
     """Transform points into the other camera (method.md, eq. 4): branch-free code, which compilers vectorise.

@@ -23,7 +23,7 @@ else:
 
 wp.set_module_options({"enable_backward": False})
 
-Pose = wp.types.vector(length=12, dtype=wp.float64)
+Pose = wp.types.vector(length=13, dtype=wp.float64)
 Rows = wp.types.matrix(shape=(3, 4), dtype=wp.float32)
 Camera = wp.types.vector(length=6, dtype=wp.float32)
 Cell = wp.types.vector(length=planes.CELL_SIZE, dtype=wp.float32)
@@ -126,7 +126,10 @@ def sum_over_points(
     if side == 1:
         turn = wp.transpose(turn)
         shift = -(turn * shift)
-    rotation, shift_m = wp.mat33(turn), wp.vec3(shift)
+    factor = pose[12]
+    shortened = wp.vec3d(wp.float64(1.0) / factor, wp.float64(1.0) / factor, wp.float64(1.0))
+    lengthened = wp.diag(wp.vec3d(factor, factor, wp.float64(1.0)))
+    rotation, shift_m = wp.mat33(lengthened * turn * wp.diag(shortened)), wp.vec3(lengthened * shift)
     total, explained = wp.float32(0.0), wp.float32(0.0)
     cells, table = images[of.image].cells, tables[of.table]
     for j in range(of.first, of.first + of.count):
@@ -178,13 +181,15 @@ def log_likelihoods(
     The sums differ from the twin's only by rounding, unless a point falls within 1e-3 px of a pixel's border.
 
     Args:
-        poses: (m, 12) rows of the 3×4 matrices of target_from_source.
+        poses: (m, 12) rows of the 3×4 matrices of target_from_source; or (m, 13), see `point_likelihood.direct`.
         pair_of: (m,) index of each pose's pair.
         pairs: the arguments of the twin after the poses.
         device: name of the Warp device.
     """
     found = wp.empty((2, len(poses)), dtype=wp.vec2, device=device)
     total = wp.empty(len(poses), dtype=wp.vec2, device=device)
+    if poses.shape[1] == 12:  # under the focal length of the views
+        poses = np.column_stack([poses, np.ones(len(poses))])
     inputs = [
         wp.array(np.ascontiguousarray(poses), dtype=Pose, device=device),
         wp.array(pair_of, dtype=wp.int32, device=device),

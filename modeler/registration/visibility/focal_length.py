@@ -1,51 +1,62 @@
-"""Posteriors of poses far apart, averaged over the focal length (method.md, eq. 29)."""
+"""The focal length as a nuisance parameter of a pair, sampled with the pose (method.md, eq. 25 and 29)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from modeler import se3
-from modeler.registration.posterior import weighted_gaussian
-from modeler.types import Array, PoseGaussian, Posterior, are_separate
-
-_FAR_RAD = 0.05  # least sd of a rotation at which poses follow the focal length differently: see method.md
-_NODE = np.sqrt(3.0)  # standard deviations: Gauss-Hermite quadrature, exact for polynomials of degree 5
-_MIDDLE, _OUTER = 2.0 / 3.0, 1.0 / 6.0  # its weights
+from modeler.se3 import rows
+from modeler.types import Array
 
 
-def averaged(found: Posterior, under: Callable[[float], Posterior], sigma_focal: float, centre_m: Array) -> Posterior:
-    """Return a posterior averaged over the focal length, if its poses are far apart; otherwise as it is.
+class FocalNuisance(NamedTuple):
+    """What is known of the focal length, and how poses follow it to first order."""
 
-    What all poses have in common stays in the derivative by the focal length. Separate modes stay as they are, too.
+    sigma: float = 0.0
+    """Standard deviation of the logarithm of the true focal length over that of the views; 0 = it is known."""
+    by_focal: Array = np.zeros(6)
+    """(6,) derivative of a pose's ξ by that logarithm."""
+
+    def draw(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw logarithms (count,) of focal lengths."""
+        return rng.normal(0.0, self.sigma, count) if self.sigma > 0.0 else np.zeros(count)
+
+    def followed(self, poses: Array, log_focal: Array) -> Array:
+        """Return poses (n, 4, 4) after following the focal length, whose logarithms (n,) have changed."""
+        return poses @ se3.exp(log_focal[:, None] * self.by_focal) if log_focal.any() else poses
+
+
+KNOWN: Final = FocalNuisance()
+"""A focal length that is known."""
+
+
+def rows_under(poses: Array, log_focal: Array | None) -> Array:
+    """Return the rows (n, 12) of poses (n, 4, 4) for kernels; under logarithms (n,) of focal lengths (n, 13)."""
+    if log_focal is None or not log_focal.any():
+        return rows(poses)
+    return np.column_stack([rows(poses), np.exp(log_focal)])
+
+
+def conditional(
+    poses: Array, weights: Array, log_focal: Array, nuisance: FocalNuisance, centre_m: Array
+) -> tuple[Array, FocalNuisance]:
+    """Return samples (n, 4, 4) given the focal length of the views, and how they follow another (method.md, eq. 25).
+
+    What poses depend on beyond first order is estimated by their regression on the focal length.
 
     Args:
-        found: the posterior under the given focal length.
-        under: returns the posterior under another, given as the logarithm of its factor.
-        sigma_focal: standard deviation of that logarithm.
-        centre_m: (3,) point of the source about which the covariance is taken.
+        poses: (n, 4, 4) before they follow the focal length to first order.
+        weights: (n,), any positive sum.
+        log_focal: (n,) logarithms of the samples' focal lengths over that of the views.
+        nuisance: how poses follow it to first order.
+        centre_m: (3,) point of the source about which their mean is taken.
     """
-    far = np.linalg.eigvalsh(found.pose.covariance[:3, :3])[-1] > _FAR_RAD**2
-    if sigma_focal == 0.0 or not found.usable or not far or are_separate(found.modes):
-        return found
-    parts = [(_MIDDLE, found, found.samples)]
-    for log_factor in (-_NODE * sigma_focal, _NODE * sigma_focal):
-        other = under(log_factor)
-        if other.usable:
-            parts.append((_OUTER, other, other.samples @ se3.exp(-log_factor * found.pose.by_focal)))
-    shares = np.array([share for share, _, _ in parts])
-    shares /= shares.sum()
-    samples = np.concatenate([poses for _, _, poses in parts])
-    weights = np.concatenate([share * one.weights for share, (_, one, _) in zip(shares, parts, strict=True)])
-    pose = weighted_gaussian(samples, weights, centre_m)
-    return replace(
-        found,
-        pose=PoseGaussian(pose.mean, pose.covariance, found.pose.by_focal),
-        samples=samples,
-        weights=weights,
-        modes=(),
-        effective_samples=1.0 / float(np.sum(weights**2)),
-        seconds=sum(one.seconds for _, one, _ in parts),
-    )
+    if not log_focal.any():
+        return poses, nuisance
+    mean, _ = se3.mean(poses, weights, about_m=centre_m)
+    shares = weights / np.sum(weights)
+    apart = shares * (log_focal - shares @ log_focal)
+    rest = nuisance._replace(by_focal=apart @ se3.log(se3.inverse(mean) @ poses) / (apart @ log_focal))
+    return rest.followed(poses, -log_focal), nuisance._replace(by_focal=nuisance.by_focal + rest.by_focal)

@@ -16,6 +16,8 @@ from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 from modeler.registration.visibility.fixed_pattern import FixedPattern
+from modeler.registration.visibility.focal_length import rows_under
+from modeler.registration.visibility.noise import significant_variances
 from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
 from modeler.registration.visibility.points import OWN_RIM, IntArray, points_of, spread_points
 from modeler.se3 import matrices, rows
@@ -27,7 +29,6 @@ _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' la
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
-_SIGNIFICANT = 2.0  # standard errors above which errors near silhouettes are part of the model
 _TAIL = 0.01  # probability of rejecting a true pose by eq. 22
 MISFIT = 0.5  # mean of r² / 2τ² if variances are right
 
@@ -266,7 +267,15 @@ class PairLikelihood:
         """
         return 1.0 / (1.0 / self.forward.model.max_independent + 1.0 / self.patches) / self.points
 
-    def scores(self, poses: Array, blur_m: float, *, stride: int, typical_misfit: float = MISFIT) -> Scores:
+    def scores(
+        self,
+        poses: Array,
+        blur_m: float,
+        *,
+        stride: int,
+        typical_misfit: float = MISFIT,
+        log_focal: Array | None = None,
+    ) -> Scores:
         """Return the scores of poses.
 
         Args:
@@ -274,9 +283,11 @@ class PairLikelihood:
             blur_m: blur of the surfaces in m.
             stride: every `stride`-th point is used, with this weight.
             typical_misfit: misfit μ of a typical match (nats).
+            log_focal: (n,) logarithms of the focal lengths under which poses are scored, over that of the views; that
+                of the views if not given.
         """
         band = 0 if self.colour is None else self.colour.scored_band(blur_m)
-        found = self._summed(poses, blur_m, band, stride=stride, typical_misfit=typical_misfit)
+        found = self._summed(rows_under(poses, log_focal), blur_m, band, stride=stride, typical_misfit=typical_misfit)
         plain, share = stride * found[:, scores.LOG_LIKELIHOOD], stride * found[:, scores.EXPLAINED] / self.points
         if self.colour is None:
             return Scores(plain, share, np.zeros(len(poses)))
@@ -284,7 +295,7 @@ class PairLikelihood:
         return Scores(plain, share, self.colour.log_likelihoods(found, band, most, stride=stride))
 
     def _summed(self, poses: Array, blur_m: float, band: int, *, stride: int, typical_misfit: float) -> Array:
-        """Return the sums (n, 6) of `scores.scores`, see `scores`; `band` is that of the colours."""
+        """Return the sums (n, 6) of `scores.scores` of `rows_under`, see `scores`; `band` is that of the colours."""
         sides = (
             *self.surfaces(stride),
             self.forward.parameters(blur_m, typical_misfit),
@@ -293,13 +304,21 @@ class PairLikelihood:
         lookups = len(poses) * sum(side.points.shape[1] for side in sides[:2])
         device = gpu.chosen(self.forward.model.device, lookups)
         if device is None or self.colour is not None:  # colours are looked up on the CPU, in the same projection
-            return scores.scores(rows(poses), *sides, self._colours(band, stride))
+            return scores.scores(poses, *sides, self._colours(band, stride))
         from modeler.kernels.gpu import visibility
 
         one = np.zeros(len(poses), dtype=np.int32)
-        return visibility.log_likelihoods(rows(poses), one, [sides], device).astype(float)
+        return visibility.log_likelihoods(poses, one, [sides], device).astype(float)
 
-    def tempered(self, poses: Array, blur_m: float, *, typical_misfit: float = MISFIT, stride: int = 1) -> Array:
+    def tempered(
+        self,
+        poses: Array,
+        blur_m: float,
+        *,
+        typical_misfit: float = MISFIT,
+        stride: int = 1,
+        log_focal: Array | None = None,
+    ) -> Array:
         """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
 
         Args:
@@ -307,8 +326,10 @@ class PairLikelihood:
             blur_m: blur of the surfaces in m.
             typical_misfit: misfit μ of a typical match (nats).
             stride: every `stride`-th point is used, with this weight.
+            log_focal: see `scores`.
         """
-        found, model = self.scores(poses, blur_m, stride=stride, typical_misfit=typical_misfit), self.forward.model
+        model = self.forward.model
+        found = self.scores(poses, blur_m, stride=stride, typical_misfit=typical_misfit, log_focal=log_focal)
         no_overlap = model.no_overlap_cost * np.exp(-found.explained / model.overlap_scale)
         return self.temper * found.surface - no_overlap + found.colours
 
@@ -325,7 +346,7 @@ class PairLikelihood:
         if self.colour is None:
             return MatchNoise(surface_m)
         band = self.colour.band(surface_m)
-        found = self._summed(pose[None], surface_m, band, stride=1, typical_misfit=MISFIT)
+        found = self._summed(rows(pose[None]), surface_m, band, stride=1, typical_misfit=MISFIT)
         return MatchNoise(surface_m, float(correlations(found)[0]), band)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
@@ -413,17 +434,20 @@ class PairLikelihood:
             return matches[:0]
         return self.colour.matches(transform, matches, points, noise.band, weight, forward=forward)
 
-    def normal_equations(self, poses: Array, noise: MatchNoise, *, stride: int) -> tuple[Array, Array]:
+    def normal_equations(
+        self, poses: Array, noise: MatchNoise, *, stride: int, log_focal: Array | None = None
+    ) -> tuple[Array, Array]:
         """Return the normal equations of the matches: gradients (n, 6) and matrices (n, 6, 6) for ξ about the centre.
 
         Args:
             poses: (n, 4, 4) target_from_source.
             noise: of matching surface and colours.
             stride: every `stride`-th point is used, with this weight.
+            log_focal: see `scores`.
         """
         colours, weight = self._colours(noise.band, stride), np.float32(weight_of(noise.correlation))
         found = gauss_newton.normal_equations(
-            rows(poses), self.surfaces(stride), colours, weight, self.centre_m, noise.surface_m
+            rows_under(poses, log_focal), self.surfaces(stride), colours, weight, self.centre_m, noise.surface_m
         )
         (gradients, of_colour), (equations, by_colour) = (stride * np.moveaxis(part, 1, 0) for part in found)
         if self.colour is not None:
@@ -440,7 +464,7 @@ class PairLikelihood:
         band, weight = 0, 0.0
         if self.colour is not None:
             band = self.colour.scored_band(blur_m)
-            found = self._summed(poses[:1], blur_m, band, stride=1, typical_misfit=MISFIT)
+            found = self._summed(rows(poses[:1]), blur_m, band, stride=1, typical_misfit=MISFIT)
             most = self.forward.model.max_independent_colours
             weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
         colours = self._colours(band, stride)
@@ -471,30 +495,3 @@ def _match_table(hidden_share: float) -> np.ndarray:
 def _per_point(regulariser: Regulariser, stride: int) -> Regulariser:
     """Return the regulariser for equations of every `stride`-th point, without their weight `stride`."""
     return regulariser._replace(precision=regulariser.precision / stride, damping=regulariser.damping / stride)
-
-
-def significant_variances(sums: Array, independent: float) -> tuple[float, float]:
-    """Return b² and the variance near silhouettes in m²; 0 for the latter within two of its standard errors.
-
-    Args:
-        sums: (3, 3), see `point_likelihood.residual_excess`.
-        independent: number of independent squares among those of the matches.
-    """
-    (aa, ab, a), (_, bb, b), (_, _, square) = sums.tolist()
-    surface_m2, rim_m2 = nonnegative_solution(aa, ab, bb, a, b)
-    determinant = max(aa * bb - ab * ab, 1e-9 * aa * bb)
-    scatter = max(square - surface_m2 * a - rim_m2 * b, 0.0) / aa  # aa is about the number of matches
-    if rim_m2**2 * determinant > _SIGNIFICANT**2 * scatter * aa * max(aa / independent, 1.0):
-        return surface_m2, rim_m2
-    return max(a, 0.0) / aa, 0.0
-
-
-def nonnegative_solution(aa: float, ab: float, bb: float, a: float, b: float) -> tuple[float, float]:
-    """Return x, y ≥ 0 of least squares, from the normal equations aa x + ab y = a and ab x + bb y = b."""
-    determinant = aa * bb - ab * ab
-    if determinant > 1e-9 * aa * bb:
-        x, y = (bb * a - ab * b) / determinant, (aa * b - ab * a) / determinant
-        if x >= 0.0 and y >= 0.0:
-            return x, y
-    x, y = max(a, 0.0) / aa, max(b, 0.0) / max(bb, 1e-300)  # one of them is 0: that which explains less
-    return (x, 0.0) if a * x >= b * y else (0.0, y)

@@ -17,9 +17,11 @@ from modeler import se3
 from modeler.kernels import point_to_plane
 from modeler.registration.posterior import FLOOR
 from modeler.registration.visibility.fixed_pattern import FixedPattern
+from modeler.registration.visibility.focal_length import KNOWN, FocalNuisance
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
 from modeler.registration.visibility.points import OWN_RIM, IntArray
+from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
 from modeler.types import Array, Camera
 
@@ -40,12 +42,12 @@ class Refiner:
         self,
         pair: PairLikelihood,
         dense: PairLikelihood,
-        samples: tuple[Array, Array],
+        samples: WeightedSamples,
         rng: np.random.Generator,
         *,
         fine_m: float,
-    ) -> Refined:
-        """Return refined samples: those of posterior × matching surface, if both are Gaussian (eq. 16).
+    ) -> Array:
+        """Return refined samples (n, 4, 4): those of posterior × matching surface, if both are Gaussian (eq. 16).
 
         Each sample moves by its own Gauss-Newton step, scaled by the surface's information relative to the samples'
         spread, and a fraction of the surface's uncertainty (randomised maximum likelihood: Oliver, He and Reynolds
@@ -54,30 +56,29 @@ class Refiner:
         Args:
             pair: the two views, at the points for the samples' steps.
             dense: the same, at the points for the mode of matching surface and its information.
-            samples: poses (n, 4, 4) of target_from_source, and their weights (n,) of any sum.
+            samples: of target_from_source; each takes its step under its focal length.
             rng: source of all randomness.
             fine_m: smallest blur in m at which matches are selected.
         """
-        (poses, weights), centre_m = samples, pair.centre_m
-        mean, covariance = se3.mean(poses, weights, about_m=centre_m)
+        centre_m = pair.centre_m
+        mean, covariance = se3.mean(samples.poses, samples.weights, about_m=centre_m)
         spread = np.asarray(np.linalg.cholesky(covariance + FLOOR), dtype=np.float64)
         dense, mode, noise = _mode(dense, mean, spread, centre_m, fine_m=fine_m)
         pair = pair.with_rim_m(dense.forward.rim_m)
         surface, colours = _equations(dense, mode, noise)
-        basis, information, by_focal = self._information(dense, mode, noise, spread, (surface, colours))
+        basis, information = self._information(dense, mode, noise, spread, (surface, colours))
         scales, axes = np.linalg.eigh(information)
         root = axes * np.sqrt(np.maximum(scales, 0.0))
         narrowed = np.linalg.inv(np.eye(6) + information)
         to_basis = np.linalg.inv(basis)
-        steps = _steps(pair, poses, noise, spread, stride=2)
+        steps = _steps(pair, samples.followed, noise, spread, stride=2, log_focal=samples.log_focal)
         # To first order, the shift of all samples by the choice of few points, and by errors common to both rims.
         there = _steps(dense, mode[None], noise, spread, stride=1, explained=surface.explained)
         steps += there - _steps(pair, mode[None], noise, spread, stride=2)
         step = steps @ to_basis.T @ information
-        scatter = rng.normal(size=(len(poses), 6)) @ root.T
+        scatter = rng.normal(size=steps.shape) @ root.T
         moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
-        from_centre = se3.adjoint(se3.translation(centre_m))
-        return Refined(se3.moved(poses, moved, centre_m), np.asarray(from_centre @ by_focal, dtype=np.float64))
+        return se3.moved(samples.poses, moved, centre_m)
 
     def _information(
         self,
@@ -86,44 +87,44 @@ class Refiner:
         noise: MatchNoise,
         spread: Array,
         equations: tuple[Equations, Equations],
-    ) -> tuple[Array, Array, Array]:
-        """Return a basis (6, 6) of ξ about the centre, the information (6, 6) in it, and ∂ξ/∂γ (6,).
-
-        Equations 14 and 25 of method.md.
-        """
+    ) -> tuple[Array, Array]:
+        """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method.md, eq. 14)."""
         surface, colours = equations
         halvings = min(self.halvings, int(np.log2(max(len(surface.residuals) / self.min_matches, 1.0))))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
-            return spread, np.zeros((6, 6)), np.zeros(6)
+            return spread, np.zeros((6, 6))
         patches = point_to_plane.bisected(surface.arms, halvings)  # of colours, too: they are those of the same matches
         sensitivity, variability = surface.scatter(spread, patches, pair.patches)
-        focal_gradient = surface.focal_gradient(spread)
         if pair.colour is not None and len(colours.residuals):
             by_colour, scatter = colours.scatter(spread, patches, pair.colour.patches(noise.band))
             shifts = np.asarray(np.linalg.solve(spread, pair.colour.shifts(mode)), dtype=np.float64)
             kept, coupled = without_shift(by_colour, shifts), by_colour @ shifts
             sensitivity = sensitivity + kept @ by_colour
             variability = variability + kept @ (scatter + coupled @ coupled.T) @ kept.T
-            focal_gradient = focal_gradient + kept @ colours.focal_gradient(spread)
         scales, axes = np.linalg.eigh(0.5 * (sensitivity + sensitivity.T))
         positive = np.diag(np.maximum(scales, 0.0))
         information = positive @ np.linalg.solve(axes.T @ variability @ axes, positive)
-        information = np.asarray(0.5 * (information + information.T), dtype=np.float64)
-        # In directions without information, the solution amplifies noise of normals. Samples follow only as far as the
-        # surface determines them, by I (1 + I)⁻¹, and so does the refinement: the first factor of eq. 25.
-        solution = axes.T @ focal_gradient / (1.0 + np.maximum(scales, 0.0))
-        kept = np.linalg.inv(np.eye(6) + information)
-        by_focal = spread @ axes @ (solution - kept @ kept @ solution)
-        return spread @ axes, information, np.asarray(by_focal, dtype=np.float64)
+        return spread @ axes, np.asarray(0.5 * (information + information.T), dtype=np.float64)
 
 
-class Refined(NamedTuple):
-    """Refined samples."""
+def first_order(pair: PairLikelihood, pose: Array, spread: Array, noise_m: float) -> FocalNuisance:
+    """Return how poses follow the focal length, by one Gauss-Newton step under either of two (method.md, eq. 25).
 
-    poses: Array
-    """(n, 4, 4) of target_from_source."""
-    by_focal: Array
-    """(6,) derivative of their mean's ξ by the logarithm of the focal length; 0 with too few matches."""
+    Args:
+        pair: the two views.
+        pose: (4, 4) target_from_source that matches.
+        spread: (6, 6) root of the covariance of ξ about it; poses do not follow where surface determines nothing.
+        noise_m: noise of matching surface.
+    """
+    sigma = pair.forward.image.sigma_focal
+    if sigma == 0.0:
+        return KNOWN
+    noise, ends = pair.match_noise(pose, noise_m), np.array([-sigma, sigma])
+    gradients, matrices = pair.normal_equations(np.stack([pose, pose]), noise, stride=1, log_focal=ends)
+    precision = matrices.mean(axis=0) + np.linalg.inv(spread @ spread.T)
+    about_centre = np.linalg.solve(precision, (gradients[1] - gradients[0]) / (2.0 * sigma))
+    by_focal = se3.adjoint(se3.translation(pair.centre_m)) @ about_centre
+    return FocalNuisance(sigma, np.asarray(by_focal, dtype=np.float64))
 
 
 def shrunk(scores: Array, shape: Array) -> Array:
@@ -191,9 +192,10 @@ def _steps(
     *,
     stride: int,
     explained: Explained | None = None,
+    log_focal: Array | None = None,
 ) -> Array:
     """Return Gauss-Newton steps (n, 6), regularised by the samples' spread, without what a nuisance explains."""
-    gradient, matrix = pair.normal_equations(poses, noise, stride=stride)
+    gradient, matrix = pair.normal_equations(poses, noise, stride=stride, log_focal=log_focal)
     if explained is not None:
         gradient, matrix = gradient - explained.gradient, matrix - explained.matrix
     regularised = matrix + np.linalg.inv(spread @ spread.T)
@@ -222,10 +224,6 @@ class Equations(NamedTuple):
     """(n,) in m; for colours without a unit."""
     weights: Array
     """(n,) in 1/m²; for colours without a unit."""
-    focal_own: Array
-    """(n,) derivatives of the residuals by the logarithm of the focal length, from the point's own normal."""
-    focal_other: Array
-    """(n,) likewise, from the other surface's."""
     pattern_slopes: Array
     """(n, 6) derivatives of f c / 2, the term of the fixed pattern."""
     pattern_curvatures: Array
@@ -245,17 +243,6 @@ class Equations(NamedTuple):
         own, other = (by_motion - by_nuisance[:, None] * share for by_motion in (self.by_own, self.by_other))
         explained = Explained(-(weighted @ self.residuals) * share, np.outer(coupled, share))
         return self._replace(by_own=own, by_other=other, explained=explained)
-
-    def focal_gradient(self, basis: Array) -> Array:
-        """Return the derivative (6,) of the normal equations' right-hand side by the logarithm of the focal length.
-
-        Args:
-            basis: (6, 6) of ξ.
-        """
-        # As in J: in products of both surfaces, the noise of normals averages out.
-        found = _products(self.by_own, self.weights * self.focal_other)
-        found += _products(self.by_other, self.weights * self.focal_own)
-        return np.asarray(0.5 * basis.T @ found, dtype=np.float64)
 
     def scatter(self, basis: Array, patches: IntArray, independent: float) -> tuple[Array, Array]:
         """Return sensitivity (6, 6) and variability (6, 6) of the sum of the equations (method.md, eq. 14 and 15).
@@ -290,17 +277,16 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
         surface = found[points]
         positions = surface[:, point_to_plane.POSITION]
         to_source = np.eye(4) if sign < 0.0 else se3.inverse(pose)
-        arms, moves = se3.transform(to_source, positions) - pair.centre_m, focal_motion(transform, positions)
+        arms = se3.transform(to_source, positions) - pair.centre_m
         colours = pair.colour_matches(transform, surface, points, noise, forward=sign > 0.0)
         rims.append(directed.rim_m * (directed.points[points, OWN_RIM] - surface[:, point_to_plane.OTHER_RIM]))
         for part, used, pattern in zip(parts, (surface, colours), (directed.pattern, FixedPattern()), strict=True):
-            at, moved = arms[: len(used)], moves[: len(used)]  # all or none
-            focal = [np.sum(used[:, k] * moved, axis=1) for k in (point_to_plane.OWN, point_to_plane.OTHER)]
+            at = arms[: len(used)]  # all or none
             own, other = (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
             derivatives = [sign * _by_motion(at, normals) for normals in (own, other)]
             residuals, weights = used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]
             slopes, curvature = _pattern_derivatives(pattern, used, at, to_source[:3, :3], directed.image.frame.camera)
-            part.append((at, *derivatives, residuals, weights, *focal, sign * slopes, curvature))
+            part.append((at, *derivatives, residuals, weights, sign * slopes, curvature))
     joined = [[np.concatenate(columns) for columns in zip(*part, strict=True)] for part in parts]
     surface, colours = (Equations(*columns, explained=None) for columns in joined)
     by_rim = np.concatenate(rims)
@@ -341,18 +327,3 @@ def _by_motion(arms: Array, slopes: Array) -> Array:
 def _position_jacobians(arms: Array) -> Array:
     """Return the derivatives (n, 6, 3) by ξ of points' positions (n, 3) about the centre."""
     return np.concatenate([se3.hat(arms), np.broadcast_to(np.eye(3), (len(arms), 3, 3))], axis=1)
-
-
-def focal_motion(transform: Array, positions: Array) -> Array:
-    """Return m (n, 3) of eq. 25: the motion of surface relative to points, by the logarithm of the focal length.
-
-    A longer focal length moves measurements towards the axis of their camera, at the same depth: the surface in its own
-    camera, and the points in theirs.
-
-    Args:
-        transform: (4, 4) transform of the points into the other camera.
-        positions: (n, 3) of the transformed points in m.
-    """
-    scaling = np.diag([-1.0, -1.0, 0.0])
-    own = se3.transform(se3.inverse(transform), positions) @ scaling @ transform[:3, :3].T
-    return np.asarray(positions @ scaling - own, dtype=np.float64)

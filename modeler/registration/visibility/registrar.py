@@ -5,15 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
-from modeler.rays import under_focal_length
 from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
-from modeler.registration.visibility.focal_length import averaged
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
-from modeler.registration.visibility.refinement import Refiner
+from modeler.registration.visibility.refinement import Refiner, first_order
 from modeler.registration.visibility.ridge import without_chance
 from modeler.registration.visibility.sampling import (
     AdaptiveSampler,
@@ -76,21 +73,6 @@ class VisibilityRegistrar(AbstractRegistrar):
         self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
     ) -> Posterior:
         """Return the posterior of target_from_source; its outcome states failure."""
-
-        def under(log_factor: float) -> Posterior:
-            other_source, other_target = (under_focal_length(view, log_factor) for view in (source, target))
-            return self._given_focal_length(other_source, other_target, density, rng)
-
-        found = self._given_focal_length(source, target, density, rng)
-        found = averaged(found, under, source.sigma_focal, source.centroid_m)
-        if found.outcome is Outcome.CONVERGED and self._is_ambiguous(found.pose):
-            return replace(found, outcome=Outcome.AMBIGUOUS)
-        return found
-
-    def _given_focal_length(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator
-    ) -> Posterior:
-        """Return the posterior under the focal length of the views."""
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
@@ -115,15 +97,22 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return samples of the mode that some candidates form."""
         noise_m, _ = pair.noises_m(found.poses[0], self.search.fine_m(pair))
         typical_misfit = pair.typical_misfit(found.poses[0], noise_m)
-        noise = {"blur_m": noise_m, "typical_misfit": typical_misfit}
         basin = self.search.extent(pair)
-        likelihood = without_chance(pair, found.poses, partial(pair.tempered, **noise), **noise, basin=basin)
+
+        def tempered(poses: Array, log_focal: Array) -> Array:
+            return pair.tempered(poses, noise_m, typical_misfit=typical_misfit, log_focal=log_focal)
+
+        likelihood = without_chance(
+            pair, found.poses, tempered, blur_m=noise_m, typical_misfit=typical_misfit, basin=basin
+        )
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
-        log_weights = likelihood(found.poses) + volumes
+        log_weights = likelihood(found.poses, np.zeros(len(found.poses))) + volumes
         if len(density.alternatives) > 1:
             log_weights += density.log_evidence(found.poses)
         gaussians = GaussianMixture(found.poses, found.spreads, log_weights, pair.centre_m)
-        samples = self.sampler.run(MixtureProposal(density, gaussians), likelihood, pair.centre_m, rng)
+        nuisance = first_order(pair, found.poses[0], found.spreads[0], noise_m)
+        proposal = MixtureProposal(density, gaussians)
+        samples = self.sampler.run(proposal, likelihood, pair.centre_m, rng, nuisance=nuisance)
         return ModeSamples(samples, noise_m, typical_misfit)
 
     def _refined(
@@ -136,10 +125,10 @@ class VisibilityRegistrar(AbstractRegistrar):
     ) -> WeightedSamples:
         """Return refined samples of a mode; those that would leave the prior's support are kept unchanged."""
         fine_m = self.search.fine_m(pair)
-        refined = self.refiner.refine(pair, dense, (samples.poses, samples.weights), rng, fine_m=fine_m)
-        inside = np.isfinite(density.log_evidence(refined.poses))
+        refined = replace(samples, poses=self.refiner.refine(pair, dense, samples, rng, fine_m=fine_m))
+        inside = np.isfinite(density.log_evidence(refined.followed))
         poses = np.where(inside[:, None, None], refined.poses, samples.poses)
-        return replace(samples, poses=poses, by_focal=refined.by_focal)
+        return replace(samples, poses=poses).conditional(pair.centre_m)
 
     def _share_at_limit(
         self,
@@ -167,7 +156,10 @@ class VisibilityRegistrar(AbstractRegistrar):
         samples = np.concatenate([mode.poses for _, mode in weighted])
         weights = np.concatenate([share * mode.weights for share, mode in weighted])
         modes = tuple(
-            Mode(share, replace(weighted_gaussian(mode.poses, mode.weights, pair.centre_m), by_focal=mode.by_focal))
+            Mode(
+                share,
+                replace(weighted_gaussian(mode.poses, mode.weights, pair.centre_m), by_focal=mode.nuisance.by_focal),
+            )
             for share, mode in weighted
         )
         separate = len(modes) == 1 or are_separate(modes)
@@ -222,14 +214,19 @@ def comparable(modes: list[ModeSamples], pair: PairLikelihood) -> list[WeightedS
     reference = min(modes, key=lambda mode: mode.noise_m)
     without_holes, gains = pair.without_holes(), []
     for mode in modes:
-        best = mode.samples.poses[[np.argmax(mode.samples.log_likelihoods)]]
-        common = without_holes.tempered(best, reference.noise_m, typical_misfit=reference.typical_misfit)
-        gains.append(float((common - pair.tempered(best, mode.noise_m, typical_misfit=mode.typical_misfit))[0]))
+        best = [np.argmax(mode.samples.log_likelihoods)]
+        found = mode.samples.followed[best], mode.samples.log_focal[best]
+        gains.append(float((_tempered(without_holes, reference, *found) - _tempered(pair, mode, *found))[0]))
     of_reference = gains[modes.index(reference)]
     return [
         replace(mode.samples, log_evidence=mode.samples.log_evidence + gain - of_reference)
         for mode, gain in zip(modes, gains, strict=True)
     ]
+
+
+def _tempered(pair: PairLikelihood, mode: ModeSamples, poses: Array, log_focal: Array) -> Array:
+    """Return tempered log-likelihoods (n,) with a mode's nuisance parameters, see `PairLikelihood.tempered`."""
+    return pair.tempered(poses, mode.noise_m, typical_misfit=mode.typical_misfit, log_focal=log_focal)
 
 
 def overlapping(

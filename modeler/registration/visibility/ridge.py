@@ -27,7 +27,7 @@ class RidgeLikelihood:
     """
 
     likelihood: LogLikelihood
-    """Of poses (n, 4, 4), tempered."""
+    """Of poses (n, 4, 4) under focal lengths, tempered."""
     poses: Array
     """(k, 4, 4) target_from_source, on the ridge."""
     chance_nats: Array
@@ -37,12 +37,12 @@ class RidgeLikelihood:
     width: Array
     """(6,) sd of the kernel that smooths between poses: rotation in rad, translation in m."""
 
-    def __call__(self, target_from_source: Array) -> Array:
-        """Return the log-likelihoods (n,) of poses (n, 4, 4)."""
+    def __call__(self, target_from_source: Array, log_focal: Array) -> Array:
+        """Return the log-likelihoods (n,) of poses (n, 4, 4) under logarithms (n,) of focal lengths."""
         offsets = se3.difference(target_from_source[:, None], self.poses[None], self.centre_m) / self.width
         squares = np.sum(offsets**2, axis=2)
         weights = np.exp(-0.5 * (squares - squares.min(axis=1, keepdims=True)))
-        return self.likelihood(target_from_source) - weights @ self.chance_nats / weights.sum(axis=1)
+        return self.likelihood(target_from_source, log_focal) - weights @ self.chance_nats / weights.sum(axis=1)
 
 
 def without_chance(

@@ -12,10 +12,11 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.registration.posterior import FLOOR, MIN_MODE_SHARE, effective_samples, normalised, pareto_tail
+from modeler.registration.visibility.focal_length import KNOWN, FocalNuisance, conditional
 from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, Array
 
-LogLikelihood = Callable[[Array], Array]  # (n, 4, 4) -> (n,)
+LogLikelihood = Callable[[Array, Array], Array]  # (n, 4, 4), (n,) -> (n,)
 
 _NEGLIGIBLE = 1e-6  # of the heaviest weight: lighter samples are left out of fits
 _INFLATION, _WIDE_FRACTION = 2.0, 0.3  # a fifth fewer rounds on a printed carton, a tenth on others; 0.5 is similar
@@ -116,7 +117,7 @@ class WeightedSamples:
     """Weighted samples of one mode."""
 
     poses: Array
-    """(n, 4, 4), all different."""
+    """(n, 4, 4), all different, before they follow the focal length."""
     weights: Array
     """(n,), their sum 1."""
     log_likelihoods: Array
@@ -125,8 +126,20 @@ class WeightedSamples:
     """Log of the mean likelihood under the prior."""
     pareto_k: float
     """Pareto tail index of the weights of all samples drawn."""
-    by_focal: Array = field(default_factory=lambda: np.zeros(6))
-    """(6,) derivative of their mean's ξ by the logarithm of the focal length; 0 before refinement."""
+    log_focal: Array = field(default_factory=lambda: np.zeros(0))
+    """(n,) logarithms of the samples' focal lengths over that of the views; empty if it is known."""
+    nuisance: FocalNuisance = KNOWN
+    """How they follow it."""
+
+    @property
+    def followed(self) -> Array:
+        """The poses (n, 4, 4), each under its focal length."""
+        return self.nuisance.followed(self.poses, self.log_focal)
+
+    def conditional(self, centre_m: Array) -> WeightedSamples:
+        """Return samples under the focal length of the views, with the exact derivative: `focal_length.conditional`."""
+        poses, nuisance = conditional(self.poses, self.weights, self.log_focal, self.nuisance, centre_m)
+        return replace(self, poses=poses, nuisance=nuisance)
 
     @property
     def effective_samples(self) -> float:
@@ -146,7 +159,9 @@ class _Draws:
     """All samples so far and their importance weights."""
 
     poses: Array
-    """(n, 4, 4)."""
+    """(n, 4, 4) before they follow the focal length."""
+    log_focal: Array
+    """(n,)."""
     log_likelihoods: Array
     """(n,); -inf outside the prior's support."""
     log_target: Array
@@ -167,6 +182,7 @@ class _Draws:
         """Return both sets of samples."""
         return _Draws(
             np.concatenate([self.poses, other.poses]),
+            np.concatenate([self.log_focal, other.log_focal]),
             np.concatenate([self.log_likelihoods, other.log_likelihoods]),
             np.concatenate([self.log_target, other.log_target]),
             np.concatenate([self.log_density, other.log_density]),
@@ -193,26 +209,36 @@ class AdaptiveSampler:
     """Least effective sample size that determines a covariance: of a proposal, and of a usable result."""
 
     def run(
-        self, proposal: AbstractPoseDensity, log_likelihood: LogLikelihood, centre_m: Array, rng: np.random.Generator
+        self,
+        proposal: AbstractPoseDensity,
+        log_likelihood: LogLikelihood,
+        centre_m: Array,
+        rng: np.random.Generator,
+        *,
+        nuisance: FocalNuisance = KNOWN,
     ) -> WeightedSamples:
         """Return samples of prior × likelihood.
 
         Args:
             proposal: first proposal, normalised; its evidence is the prior.
-            log_likelihood: of poses (n, 4, 4), (n,); called only inside the prior's support.
+            log_likelihood: of poses (n, 4, 4) under logarithms (n,) of focal lengths, (n,); called only inside the
+                prior's support.
             centre_m: (3,) point of the source about which Gaussians are fitted.
             rng: source of all randomness.
+            nuisance: the focal length; proposals are for poses that do not follow it.
         """
         first = proposal.sample(self.draws, rng)
         log_count = float(np.log(self.draws))
 
         def weighted(poses: Array, log_density: Array) -> _Draws:
-            log_prior = proposal.log_evidence(poses)
+            log_focal = nuisance.draw(len(poses), rng)
+            followed = nuisance.followed(poses, log_focal)
+            log_prior = proposal.log_evidence(followed)
             possible = np.isfinite(log_prior)
             log_likelihoods = np.full(len(poses), -np.inf)
             if possible.any():
-                log_likelihoods[possible] = log_likelihood(poses[possible])
-            return _Draws(poses, log_likelihoods, log_prior + log_likelihoods, log_density)
+                log_likelihoods[possible] = log_likelihood(followed[possible], log_focal[possible])
+            return _Draws(poses, log_focal, log_likelihoods, log_prior + log_likelihoods, log_density)
 
         drawn, fitted = weighted(first, log_count + proposal.log_density(first)), None
         log_weights = drawn.log_weights
@@ -235,6 +261,8 @@ class AdaptiveSampler:
             drawn.log_likelihoods[chosen],
             _log_mean_exp(log_weights),
             pareto_tail(log_weights),
+            drawn.log_focal[chosen],
+            nuisance,
         )
 
 
