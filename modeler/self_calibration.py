@@ -69,7 +69,8 @@ class FocalCalibrator:
     def _registered(self, edge: Edge, made: _Made, register: Register, prior: AbstractPrior) -> Factor | None:
         """Return an edge under another focal length; None if its change is unknown.
 
-        If it cannot be registered again, such as steps at the limit of the search, its derivative predicts the change.
+        If it cannot be registered again, such as steps at the limit of the search, its derivative predicts the change;
+        edges of a run with an exact focal length have none.
 
         Args:
             edge: of the run, whose solution proposes where to search: the focal length changes it by a few degrees.
@@ -79,10 +80,7 @@ class FocalCalibrator:
         """
         proposal = PredictedProposal(prior, collapse_modes(edge.posterior))
         posterior = register(made.view(edge.source), made.view(edge.target), proposal)
-        if not posterior.usable:
-            foretold = collapse_modes(edge.posterior.under(made.centre))
-            return Factor(edge, foretold) if foretold.by_focal.any() else None
-        pose = collapse_modes(posterior)
+        pose = collapse_modes(posterior if posterior.usable else edge.posterior.under(made.centre))
         return Factor(edge, pose) if pose.by_focal.any() else None
 
 

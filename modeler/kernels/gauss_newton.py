@@ -20,8 +20,8 @@ from modeler.kernels.point_likelihood import (
     Y,
     Z,
     buffers,
-    direct,
     project,
+    write_transform,
 )
 from modeler.kernels.point_to_plane import linearise
 from modeler.kernels.threads import over_rows
@@ -49,8 +49,8 @@ def normal_equations(poses, surfaces, colours, weight, centre, surface_m):
     """Return gradients (m, 2, 6) and matrices (m, 2, 6, 6) of surface and of colours at poses (m, 12), see `equations`.
 
     Args:
-        poses: rows of the 3×4 matrices of target_from_source; or (m, 13), see `direct`. Derivatives are then those of
-            points as they are, which differ from those under the true focal length by its relative error.
+        poses: rows of the 3×4 matrices of target_from_source; or (m, 13), see `write_transform`. Derivatives are then
+            those of points as they are, which differ from those under the true focal length by its relative error.
         surfaces: the `Projection` of the source's points in the target, and that of the target's in the source.
         colours: their `Colours`, or `photometric.NO_COLOURS`.
         weight: inverse variance of the difference of features (method.md, eq. 20).
@@ -102,7 +102,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
     -ξ about the centre. One loop over directions and kinds of equations, since compiling is slow.
 
     Args:
-        pose: (12,) rows of target_from_source; or (13,), see `direct`.
+        pose: (12,) rows of target_from_source; or (13,), see `write_transform`.
         surfaces: see `normal_equations`.
         colours: see `normal_equations`.
         weight: see `normal_equations`.
@@ -122,7 +122,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
         surface, features = surfaces[direction], colours[direction]
         count = surface.points.shape[1]
         if kind == 0:
-            direct(pose, direction == 1, transform)
+            write_transform(pose, direction == 1, transform)
             for k in range(3):
                 about[k] = centre[k]
                 if direction == 0:

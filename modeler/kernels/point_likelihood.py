@@ -87,7 +87,7 @@ def invert(pose, inverse):
 
 
 @numba.njit(cache=True, forceinline=True)
-def direct(pose, backward, transform):
+def write_transform(pose, backward, transform):
     """Write the rows of the 3×4 matrix that takes points of one view to the other into `transform` (12,).
 
     Args:

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 
 from modeler.kernels.photometric import NO_COLOURS, fetch_features, sum_moments
-from modeler.kernels.point_likelihood import buffers, direct, project, sum_over_points
+from modeler.kernels.point_likelihood import buffers, project, sum_over_points, write_transform
 from modeler.kernels.threads import over_rows
 
 # Columns of `scores`. The last four are Σ a b, Σ a², Σ b² and the number of the features a and b of matching points.
@@ -17,7 +17,7 @@ def scores(poses, forward, backward, forward_parameters, backward_parameters, co
     In single precision, the error is below 1e-4 nats per point unless a point falls within 1e-3 px of a pixel's border.
 
     Args:
-        poses: (m, 12) float64 rows of the 3×4 matrices of target_from_source; or (m, 13), see `direct`.
+        poses: (m, 12) float64 rows of the 3×4 matrices of target_from_source; or (m, 13), see `write_transform`.
         forward: the `Projection` of the source's points in the target.
         backward: the `Projection` of the target's points in the source.
         forward_parameters: the `LikelihoodParameters` of the forward direction.
@@ -40,7 +40,7 @@ def _scores(poses, projections, parameters, colours):
     (transformed, pixels, looked_up), seen = buffers(most), np.empty(most, dtype=np.float32)
     for i in range(poses.shape[0]):
         for direction in range(2):  # one copy of the code: compiling is slow
-            direct(poses[i], direction == 1, transform)
+            write_transform(poses[i], direction == 1, transform)
             projection, features, model = projections[direction], colours[direction], parameters[direction]
             project(transform, projection, transformed, pixels, looked_up)
             total, explained = sum_over_points(projection.points, transformed, looked_up, model)

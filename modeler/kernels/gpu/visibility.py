@@ -181,7 +181,8 @@ def log_likelihoods(
     The sums differ from the twin's only by rounding, unless a point falls within 1e-3 px of a pixel's border.
 
     Args:
-        poses: (m, 12) rows of the 3×4 matrices of target_from_source; or (m, 13), see `point_likelihood.direct`.
+        poses: (m, 12) rows of the 3×4 matrices of target_from_source; or (m, 13), see
+            `point_likelihood.write_transform`.
         pair_of: (m,) index of each pose's pair.
         pairs: the arguments of the twin after the poses.
         device: name of the Warp device.

@@ -12,7 +12,7 @@ from modeler.types import Array
 
 
 class FocalNuisance(NamedTuple):
-    """What is known of the focal length, and how poses follow it to first order."""
+    """What is known of the focal length, and how poses depend on it."""
 
     sigma: float = 0.0
     """Standard deviation of the logarithm of the true focal length over that of the views; 0 = it is known."""
@@ -23,8 +23,8 @@ class FocalNuisance(NamedTuple):
         """Draw logarithms (count,) of focal lengths."""
         return rng.normal(0.0, self.sigma, count) if self.sigma > 0.0 else np.zeros(count)
 
-    def followed(self, poses: Array, log_focal: Array) -> Array:
-        """Return poses (n, 4, 4) after following the focal length, whose logarithms (n,) have changed."""
+    def under(self, poses: Array, log_focal: Array) -> Array:
+        """Return poses (n, 4, 4) under other focal lengths, given as logarithms (n,) of their factors."""
         return poses @ se3.exp(log_focal[:, None] * self.by_focal) if log_focal.any() else poses
 
 
@@ -37,26 +37,3 @@ def rows_under(poses: Array, log_focal: Array | None) -> Array:
     if log_focal is None or not log_focal.any():
         return rows(poses)
     return np.column_stack([rows(poses), np.exp(log_focal)])
-
-
-def conditional(
-    poses: Array, weights: Array, log_focal: Array, nuisance: FocalNuisance, centre_m: Array
-) -> tuple[Array, FocalNuisance]:
-    """Return samples (n, 4, 4) given the focal length of the views, and how they follow another (method.md, eq. 25).
-
-    What poses depend on beyond first order is estimated by their regression on the focal length.
-
-    Args:
-        poses: (n, 4, 4) before they follow the focal length to first order.
-        weights: (n,), any positive sum.
-        log_focal: (n,) logarithms of the samples' focal lengths over that of the views.
-        nuisance: how poses follow it to first order.
-        centre_m: (3,) point of the source about which their mean is taken.
-    """
-    if not log_focal.any():
-        return poses, nuisance
-    mean, _ = se3.mean(poses, weights, about_m=centre_m)
-    shares = weights / np.sum(weights)
-    apart = shares * (log_focal - shares @ log_focal)
-    rest = nuisance._replace(by_focal=apart @ se3.log(se3.inverse(mean) @ poses) / (apart @ log_focal))
-    return rest.followed(poses, -log_focal), nuisance._replace(by_focal=nuisance.by_focal + rest.by_focal)

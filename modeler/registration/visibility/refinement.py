@@ -71,7 +71,7 @@ class Refiner:
         root = axes * np.sqrt(np.maximum(scales, 0.0))
         narrowed = np.linalg.inv(np.eye(6) + information)
         to_basis = np.linalg.inv(basis)
-        steps = _steps(pair, samples.followed, noise, spread, stride=2, log_focal=samples.log_focal)
+        steps = _steps(pair, samples.under_focal_lengths, noise, spread, stride=2, log_focal=samples.log_focal)
         # To first order, the shift of all samples by the choice of few points, and by errors common to both rims.
         there = _steps(dense, mode[None], noise, spread, stride=1, explained=surface.explained)
         steps += there - _steps(pair, mode[None], noise, spread, stride=2)
@@ -108,12 +108,12 @@ class Refiner:
 
 
 def first_order(pair: PairLikelihood, pose: Array, spread: Array, noise_m: float) -> FocalNuisance:
-    """Return how poses follow the focal length, by one Gauss-Newton step under either of two (method.md, eq. 25).
+    """Return how poses depend on the focal length, by a Gauss-Newton step under either of two (method.md, eq. 29).
 
     Args:
         pair: the two views.
         pose: (4, 4) target_from_source that matches.
-        spread: (6, 6) root of the covariance of ξ about it; poses do not follow where surface determines nothing.
+        spread: (6, 6) root of the covariance of ξ about it; it limits what surface does not determine.
         noise_m: noise of matching surface.
     """
     sigma = pair.forward.image.sigma_focal

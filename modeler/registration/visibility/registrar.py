@@ -126,7 +126,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return refined samples of a mode; those that would leave the prior's support are kept unchanged."""
         fine_m = self.search.fine_m(pair)
         refined = replace(samples, poses=self.refiner.refine(pair, dense, samples, rng, fine_m=fine_m))
-        inside = np.isfinite(density.log_evidence(refined.followed))
+        inside = np.isfinite(density.log_evidence(refined.under_focal_lengths))
         poses = np.where(inside[:, None, None], refined.poses, samples.poses)
         return replace(samples, poses=poses).conditional(pair.centre_m)
 
@@ -215,7 +215,7 @@ def comparable(modes: list[ModeSamples], pair: PairLikelihood) -> list[WeightedS
     without_holes, gains = pair.without_holes(), []
     for mode in modes:
         best = [np.argmax(mode.samples.log_likelihoods)]
-        found = mode.samples.followed[best], mode.samples.log_focal[best]
+        found = mode.samples.under_focal_lengths[best], mode.samples.log_focal[best]
         gains.append(float((_tempered(without_holes, reference, *found) - _tempered(pair, mode, *found))[0]))
     of_reference = gains[modes.index(reference)]
     return [

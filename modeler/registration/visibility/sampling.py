@@ -12,7 +12,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.kernels import mixture
 from modeler.registration.posterior import FLOOR, MIN_MODE_SHARE, effective_samples, normalised, pareto_tail
-from modeler.registration.visibility.focal_length import KNOWN, FocalNuisance, conditional
+from modeler.registration.visibility.focal_length import KNOWN, FocalNuisance
 from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, Array
 
@@ -117,7 +117,7 @@ class WeightedSamples:
     """Weighted samples of one mode."""
 
     poses: Array
-    """(n, 4, 4), all different, before they follow the focal length."""
+    """(n, 4, 4), all different, under the focal length of the views to first order."""
     weights: Array
     """(n,), their sum 1."""
     log_likelihoods: Array
@@ -129,17 +129,29 @@ class WeightedSamples:
     log_focal: Array = field(default_factory=lambda: np.zeros(0))
     """(n,) logarithms of the samples' focal lengths over that of the views; empty if it is known."""
     nuisance: FocalNuisance = KNOWN
-    """How they follow it."""
+    """How poses depend on it."""
 
     @property
-    def followed(self) -> Array:
-        """The poses (n, 4, 4), each under its focal length."""
-        return self.nuisance.followed(self.poses, self.log_focal)
+    def under_focal_lengths(self) -> Array:
+        """The poses (n, 4, 4), each under its own focal length."""
+        return self.nuisance.under(self.poses, self.log_focal)
 
     def conditional(self, centre_m: Array) -> WeightedSamples:
-        """Return samples under the focal length of the views, with the exact derivative: `focal_length.conditional`."""
-        poses, nuisance = conditional(self.poses, self.weights, self.log_focal, self.nuisance, centre_m)
-        return replace(self, poses=poses, nuisance=nuisance)
+        """Return samples given the focal length of the views, and how they depend on it (method.md, eq. 25).
+
+        What is left of this beyond first order is their regression on it.
+
+        Args:
+            centre_m: (3,) point of the source about which their mean is taken.
+        """
+        if not self.log_focal.any():
+            return self
+        mean, _ = se3.mean(self.poses, self.weights, about_m=centre_m)
+        apart = self.weights * (self.log_focal - self.weights @ self.log_focal)
+        by_focal = apart @ se3.log(se3.inverse(mean) @ self.poses) / (apart @ self.log_focal)
+        rest = self.nuisance._replace(by_focal=by_focal)
+        total = self.nuisance._replace(by_focal=self.nuisance.by_focal + by_focal)
+        return replace(self, poses=rest.under(self.poses, -self.log_focal), nuisance=total)
 
     @property
     def effective_samples(self) -> float:
@@ -159,7 +171,7 @@ class _Draws:
     """All samples so far and their importance weights."""
 
     poses: Array
-    """(n, 4, 4) before they follow the focal length."""
+    """(n, 4, 4), see `WeightedSamples`."""
     log_focal: Array
     """(n,)."""
     log_likelihoods: Array
@@ -225,19 +237,19 @@ class AdaptiveSampler:
                 prior's support.
             centre_m: (3,) point of the source about which Gaussians are fitted.
             rng: source of all randomness.
-            nuisance: the focal length; proposals are for poses that do not follow it.
+            nuisance: the focal length; proposals are for poses under that of the views.
         """
         first = proposal.sample(self.draws, rng)
         log_count = float(np.log(self.draws))
 
         def weighted(poses: Array, log_density: Array) -> _Draws:
             log_focal = nuisance.draw(len(poses), rng)
-            followed = nuisance.followed(poses, log_focal)
-            log_prior = proposal.log_evidence(followed)
+            moved = nuisance.under(poses, log_focal)
+            log_prior = proposal.log_evidence(moved)
             possible = np.isfinite(log_prior)
             log_likelihoods = np.full(len(poses), -np.inf)
             if possible.any():
-                log_likelihoods[possible] = log_likelihood(followed[possible], log_focal[possible])
+                log_likelihoods[possible] = log_likelihood(moved[possible], log_focal[possible])
             return _Draws(poses, log_focal, log_likelihoods, log_prior + log_likelihoods, log_density)
 
         drawn, fitted = weighted(first, log_count + proposal.log_density(first)), None
