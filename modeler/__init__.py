@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from modeler.rays import Sensor
     from modeler.registration import VisibilityRegistrar
     from modeler.segmentation import Segmenter
+    from modeler.sequences import open_sequence
     from modeler.types import (
         Camera,
         Frame,
@@ -61,7 +62,6 @@ if TYPE_CHECKING:
         Solution,
         Step,
     )
-    from sequences import open_sequence
 
 _MODULES = {
     "modeler.api": ("Result", "build", "register"),

@@ -20,10 +20,10 @@ from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
+from modeler.sequences import AbstractSequence
+from modeler.sequences import open_sequence as opened
 from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step
-from sequences import AbstractSequence
-from sequences import open_sequence as opened
-from viz.stream import open_stream
+from modeler.viz.stream import open_stream
 
 Intrinsics = Camera | npt.ArrayLike
 """A camera, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix."""

@@ -2,25 +2,25 @@
 
 from pathlib import Path
 
+from modeler.sequences.base import AbstractSequence as AbstractSequence
+from modeler.sequences.base import KeptSequence as KeptSequence
+from modeler.sequences.base import frame_range as frame_range
+from modeler.sequences.bop import BopSequence as BopSequence
+from modeler.sequences.bop import true_mesh as true_mesh
+from modeler.sequences.bop import write_bop as write_bop
+from modeler.sequences.focal_length import FocalFactor as FocalFactor
+from modeler.sequences.focal_length import RefocusedSequence as RefocusedSequence
+from modeler.sequences.focal_length import read_focal_factor as read_focal_factor
+from modeler.sequences.intrinsics import Overrides as Overrides
+from modeler.sequences.noise_model import CalibratedSequence as CalibratedSequence
+from modeler.sequences.noise_model import NoiseModel as NoiseModel
+from modeler.sequences.noise_model import read_noise as read_noise
+from modeler.sequences.opening import open_sequence as open_sequence
+from modeler.sequences.survey import Survey as Survey
+from modeler.sequences.survey import survey as survey
+from modeler.sequences.watch import WatchLimits as WatchLimits
+from modeler.sequences.watch import watch as watch
 from modeler.types import InputError
-from sequences.base import AbstractSequence as AbstractSequence
-from sequences.base import KeptSequence as KeptSequence
-from sequences.base import frame_range as frame_range
-from sequences.bop import BopSequence as BopSequence
-from sequences.bop import true_mesh as true_mesh
-from sequences.bop import write_bop as write_bop
-from sequences.focal_length import FocalFactor as FocalFactor
-from sequences.focal_length import RefocusedSequence as RefocusedSequence
-from sequences.focal_length import read_focal_factor as read_focal_factor
-from sequences.intrinsics import Overrides as Overrides
-from sequences.noise_model import CalibratedSequence as CalibratedSequence
-from sequences.noise_model import NoiseModel as NoiseModel
-from sequences.noise_model import read_noise as read_noise
-from sequences.opening import open_sequence as open_sequence
-from sequences.survey import Survey as Survey
-from sequences.survey import survey as survey
-from sequences.watch import WatchLimits as WatchLimits
-from sequences.watch import watch as watch
 
 
 def bundled(name: str) -> Path:

@@ -17,9 +17,8 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.regular_files import left_behind
-from modeler.types import Array, BoolArray, Camera, Frame, InputError
-from sequences.base import AbstractSequence
-from sequences.image_files import (
+from modeler.sequences.base import AbstractSequence
+from modeler.sequences.image_files import (
     check_same_size,
     check_size,
     metres,
@@ -31,10 +30,11 @@ from sequences.image_files import (
     read_mask,
     write_image,
 )
-from sequences.input_files import Node, entries, first_folder, frame_number, is_there, read_tree
-from sequences.intrinsics import RANGE, Intrinsics, Overrides, of_matrix
-from sequences.recording import AbstractRecording
-from sequences.rendering.meshes import Mesh, read_mesh
+from modeler.sequences.input_files import Node, entries, first_folder, frame_number, is_there, read_tree
+from modeler.sequences.intrinsics import RANGE, Intrinsics, Overrides, of_matrix
+from modeler.sequences.recording import AbstractRecording
+from modeler.sequences.rendering.meshes import Mesh, read_mesh
+from modeler.types import Array, BoolArray, Camera, Frame, InputError
 
 
 def intrinsics(node: Node) -> Intrinsics:

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.regular_files import open_regular, unreadable
+from modeler.sequences.image_files import MAX_PIXELS
+from modeler.sequences.image_folders import frame_numbers
+from modeler.sequences.input_files import input_errors, list_images
+from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
+from modeler.sequences.recording import AbstractRecording
 from modeler.types import Array, Camera, Frame, InputError
-from sequences.image_files import MAX_PIXELS
-from sequences.image_folders import frame_numbers
-from sequences.input_files import input_errors, list_images
-from sequences.intrinsics import Intrinsics, Overrides, sane
-from sequences.recording import AbstractRecording
 
 SUFFIXES = (".pcd", ".ply")
 MAX_OFF_PX = 1.0

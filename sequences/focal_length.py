@@ -11,9 +11,9 @@ from typing import Literal, final
 
 import numpy as np
 
+from modeler.sequences.base import AbstractDerived
+from modeler.sequences.input_files import read_tree
 from modeler.types import Frame, InputError, SensorNoise
-from sequences.base import AbstractDerived
-from sequences.input_files import read_tree
 
 _ALIKE = 1e-3  # relative: files have rounded values
 

@@ -10,11 +10,11 @@ from typing import final
 import numpy as np
 
 from modeler import se3
+from modeler.sequences.base import AbstractDerived, AbstractSequence
+from modeler.sequences.image_folders import trajectory
+from modeler.sequences.input_files import Node
+from modeler.sequences.recording import AbstractRecording
 from modeler.types import Array, BoolArray, Frame, HandPoses, InputError
-from sequences.base import AbstractDerived, AbstractSequence
-from sequences.image_folders import trajectory
-from sequences.input_files import Node
-from sequences.recording import AbstractRecording
 
 _MOST = 100  # capsules: 10 s a run of 100 frames
 

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from modeler.regular_files import open_regular, unreadable
+from modeler.sequences.input_files import entries
 from modeler.types import BoolArray, InputError
-from sequences.input_files import entries
 
 MAX_PIXELS = 50_000_000
 """Larger images are refused before they are decoded: no depth camera makes them, decompression bombs do."""

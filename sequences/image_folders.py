@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.types import Array, Camera, Frame, InputError
-from sequences.image_files import (
+from modeler.sequences.image_files import (
     check_same_size,
     check_size,
     image_size,
@@ -28,9 +27,18 @@ from sequences.image_files import (
     read_mask,
     resize_to_depth,
 )
-from sequences.input_files import check_link, entries, first_folder, frame_number, is_there, list_images, read_text
-from sequences.intrinsics import CameraFacts, Intrinsics, Overrides, find_intrinsics
-from sequences.recording import AbstractRecording, paired
+from modeler.sequences.input_files import (
+    check_link,
+    entries,
+    first_folder,
+    frame_number,
+    is_there,
+    list_images,
+    read_text,
+)
+from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, find_intrinsics
+from modeler.sequences.recording import AbstractRecording, paired
+from modeler.types import Array, Camera, Frame, InputError
 
 
 @final

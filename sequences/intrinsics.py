@@ -9,8 +9,8 @@ from typing import final
 
 import numpy as np
 
+from modeler.sequences.input_files import Node, is_there, read_text, read_tree
 from modeler.types import Array, InputError
-from sequences.input_files import Node, is_there, read_text, read_tree
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy in px."""

@@ -13,11 +13,11 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.sequences.base import AbstractSequence, check_every, span
+from modeler.sequences.image_files import metres
+from modeler.sequences.intrinsics import Overrides
+from modeler.sequences.lens import Lens, coefficients
 from modeler.types import Array, Camera, Frame, InputError, SensorNoise
-from sequences.base import AbstractSequence, check_every, span
-from sequences.image_files import metres
-from sequences.intrinsics import Overrides
-from sequences.lens import Lens, coefficients
 
 FIRST = 10
 """Number of frames taken before the sequence is described."""

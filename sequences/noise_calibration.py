@@ -11,9 +11,9 @@ from scipy.ndimage import binary_dilation, correlate
 from scipy.optimize import nnls
 from scipy.signal import savgol_coeffs
 
+from modeler.sequences.base import AbstractSequence
+from modeler.sequences.noise_model import NoiseModel, slope_terms
 from modeler.types import Array, BoolArray, Camera, InputError
-from sequences.base import AbstractSequence
-from sequences.noise_model import NoiseModel, slope_terms
 
 REACH = 4
 """Pixels on either side of a border that must belong to the near and to the far thing."""

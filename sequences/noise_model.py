@@ -11,9 +11,9 @@ from typing import final
 
 import numpy as np
 
+from modeler.sequences.base import AbstractDerived
+from modeler.sequences.input_files import Node, read_tree
 from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Array, Frame, SensorNoise
-from sequences.base import AbstractDerived
-from sequences.input_files import Node, read_tree
 
 MAX_ANGLE_RAD = np.radians(85.0)
 """Beyond, the model's noise would grow without bounds and is kept constant."""

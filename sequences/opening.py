@@ -7,16 +7,16 @@ import difflib
 from pathlib import Path
 
 from modeler.regular_files import check_regular
+from modeler.sequences.base import AbstractSequence
+from modeler.sequences.bop import BopSequence
+from modeler.sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
+from modeler.sequences.clouds import open_clouds
+from modeler.sequences.hand_shapes import with_hand
+from modeler.sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, open_tum
+from modeler.sequences.input_files import check_links, entries, is_there
+from modeler.sequences.intrinsics import Overrides
+from modeler.sequences.live import SCHEME, open_camera
 from modeler.types import InputError
-from sequences.base import AbstractSequence
-from sequences.bop import BopSequence
-from sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
-from sequences.clouds import open_clouds
-from sequences.hand_shapes import with_hand
-from sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, open_tum
-from sequences.input_files import check_links, entries, is_there
-from sequences.intrinsics import Overrides
-from sequences.live import SCHEME, open_camera
 
 FORMATS = (
     "a folder with depth/ (BOP, TUM RGB-D, Open3D, BundleSDF, your own), organised clouds, a ROS bag, a RealSense "
@@ -63,13 +63,13 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
     elif overrides.strict_paths:
         check_links(path)
     if path.suffix.lower() in BAGS or is_there(path / "metadata.yaml"):
-        from sequences.ros.sequence import open_ros
+        from modeler.sequences.ros.sequence import open_ros
 
         return open_ros(path, overrides)
     if is_there(path / "report.json"):
         raise InputError(f"{path}: is the folder of a run; give the sequence it was made from, or convert its poses.")
     if path.is_file() and path.suffix.lower() == ".mkv":
-        from sequences.kinect import open_kinect
+        from modeler.sequences.kinect import open_kinect
 
         return open_kinect(path, overrides)
     if (path.is_file() and path.suffix.lower() in CLOUD_SUFFIXES) or _holds_clouds(path):

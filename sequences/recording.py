@@ -12,10 +12,10 @@ from typing import Generic, TypeVar, final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.sequences.base import AbstractSequence, span
+from modeler.sequences.input_files import Node, is_there, read_tree
+from modeler.sequences.lens import Lens
 from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Array, Frame, InputError, SensorNoise
-from sequences.base import AbstractSequence, span
-from sequences.input_files import Node, is_there, read_tree
-from sequences.lens import Lens
 
 
 @dataclass(frozen=True)

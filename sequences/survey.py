@@ -7,8 +7,8 @@ from typing import final
 
 import numpy as np
 
+from modeler.sequences.base import AbstractSequence, span
 from modeler.types import Camera, Frame, InputError
-from sequences.base import AbstractSequence, span
 
 NEAREST_M = 0.01
 FARTHEST_M = 100.0

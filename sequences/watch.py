@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
+from modeler.sequences.base import AbstractDerived, AbstractSequence, check_every
+from modeler.sequences.intrinsics import Overrides
+from modeler.sequences.opening import open_sequence
+from modeler.sequences.survey import survey
 from modeler.types import Frame, InputError
-from sequences.base import AbstractDerived, AbstractSequence, check_every
-from sequences.intrinsics import Overrides
-from sequences.opening import open_sequence
-from sequences.survey import survey
 
 END = "done"
 """A file of this name in the folder marks the end of the sequence."""

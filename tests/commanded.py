@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from modeler.cli import main
-from sequences import bundled
+from modeler.sequences import bundled
 
 BOX = str(bundled("box"))
 QUICK = ("--prior", "table", "--method", "icp")

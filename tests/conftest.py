@@ -20,8 +20,8 @@ from turning_box import COUNT, LOST, steps
 
 from modeler import concurrency
 from modeler.cli import main
+from modeler.sequences import bundled, write_bop
 from modeler.types import Frame, Step
-from sequences import bundled, write_bop
 
 
 @pytest.fixture

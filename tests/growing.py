@@ -23,9 +23,9 @@ from PIL import Image
 from scipy import ndimage
 
 from modeler import Modeler, Step, TablePrior
+from modeler.sequences import open_sequence
 from modeler.types import Array, BoolArray
-from sequences import open_sequence
-from viz.report.mesh import look_at, shade
+from modeler.viz.report.mesh import look_at, shade
 
 SIDE_PX = 300
 MAGNIFIED = 40.0  # regions of positions, which are millimetres beside a circle of 0.7 m

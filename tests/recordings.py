@@ -13,8 +13,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.sequences import bundled, open_sequence
 from modeler.types import Camera, Frame
-from sequences import bundled, open_sequence
 
 STEP = 4  # every fourth pixel of the bundled images
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from modeler import se3
+from modeler.sequences import write_bop
 from modeler.types import Camera, Frame
-from sequences import write_bop
 
 CAMERA = Camera(40, 30, 57.5, 58.5, 19.25, 14.75)
 INDICES = (3, 7, 12)

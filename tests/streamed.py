@@ -10,8 +10,8 @@ import numpy as np
 import rerun.chunk
 
 from modeler.types import Array, Step
-from viz import entities
-from viz.stream import open_stream
+from modeler.viz import entities
+from modeler.viz.stream import open_stream
 
 Recording = dict[str, dict[int, dict[str, Any]]]
 MERGED = (entities.MERGED_BEFORE, entities.MERGED_AFTER)

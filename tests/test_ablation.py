@@ -16,7 +16,7 @@ from slow import sampled
 from modeler.evaluation import true_motion
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
-from sequences import bundled, open_sequence
+from modeler.sequences import bundled, open_sequence
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import tabletop
 
 import modeler
 from modeler import se3
-from sequences import bundled
+from modeler.sequences import bundled
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 PAIR, BUILD, LOOP = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -40,7 +40,7 @@ import numpy, scipy.linalg
 blas = set(os.listdir("/proc/self/task")) - others
 from modeler import GeneralPrior, Sensor
 from modeler.registration import VisibilityRegistrar
-from sequences import bundled, open_sequence
+from modeler.sequences import bundled, open_sequence
 sequence = open_sequence(bundled("box"))
 frames = [sequence.frame(index) for index in (0, 1)]
 def registered(seed):

@@ -13,8 +13,8 @@ from recordings import png_claiming
 from refusal import refused
 from small_scene import CAMERA, INDICES, META, frame, random_frames, random_truth, written
 
+from modeler.sequences import BopSequence, open_sequence, survey, write_bop
 from modeler.types import Frame, InputError, SensorNoise
-from sequences import BopSequence, open_sequence, survey, write_bop
 
 
 @pytest.fixture

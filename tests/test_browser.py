@@ -21,10 +21,10 @@ from turning_box import object_from_camera, steps
 from modeler import se3
 from modeler.cli import main
 from modeler.export import RunFolder, RunMeta
-from sequences import bundled
-from viz import viewer
-from viz.report import write_page
-from viz.stream import open_stream
+from modeler.sequences import bundled
+from modeler.viz import viewer
+from modeler.viz.report import write_page
+from modeler.viz.stream import open_stream
 
 pytestmark = pytest.mark.skipif(chromium.EXECUTABLE is None, reason="Chromium is not installed")
 COUNT = 4

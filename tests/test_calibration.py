@@ -21,9 +21,9 @@ from modeler.priors import TablePrior
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.sampling import AdaptiveSampler
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import AbstractPoseDensity, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
-from sequences.rendering.renderer import RenderedSequence
-from viz.figures import coverage_curves
+from modeler.viz.figures import coverage_curves
 
 BLANK = Trial("tuning", "n-fold", "box", "usual", "table", OURS, 1, 0, outcome=OUTSIDE)
 CENTROID_M = np.array([0.05, -0.02, 0.8])

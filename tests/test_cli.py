@@ -23,8 +23,8 @@ from modeler.cli.console import Interrupt
 from modeler.cli.options import PriorOptions
 from modeler.export import RunFolder, model_upright
 from modeler.registration.baselines import kiss
+from modeler.sequences import bundled, open_sequence
 from modeler.types import ACCEPTED, Outcome
-from sequences import bundled, open_sequence
 
 TUBE = bundled("tube")
 QUICK = ("--prior", "table", "--voxel-m", "0.004", "--frames", "0:3")

@@ -28,8 +28,8 @@ from modeler.cli.console import Console, Interrupt
 from modeler.cli.info import Info
 from modeler.cli.inputs import reading
 from modeler.cli.options import ObjectOptions
+from modeler.sequences import bundled, open_sequence
 from modeler.types import Failed, Outcome, PriorRefused, Reason, Searching, Segmentation, Solution, Step
-from sequences import bundled, open_sequence
 
 COMMAND = [sys.executable, "-m", "modeler"]
 FEW = Outcome.TOO_FEW_POINTS

@@ -33,7 +33,7 @@ from modeler.types import (
     RayImage,
     Solution,
 )
-from viz.figures import rotation_errors
+from modeler.viz.figures import rotation_errors
 
 
 class Refusing(AbstractPrior):

@@ -14,8 +14,8 @@ from made_up import ball
 from modeler import se3
 from modeler.export import physics, solids
 from modeler.export.checks import Checks, mesh_checks
+from modeler.sequences import open_sequence
 from modeler.types import Array, InputError, ObjectModel
-from sequences import open_sequence
 
 SIDES_M = np.array([0.06, 0.1, 0.2])
 

@@ -12,7 +12,7 @@ from prior_cases import surface
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.features import FeatureMatcher, fpfh, kabsch, mutual_matches
-from sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.renderer import RenderedSequence
 
 MOVED = se3.exp(np.array([0.3, -0.8, 0.5, 0.1, -0.2, 0.4]))
 

@@ -23,6 +23,7 @@ from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.focal_length import FocalNuisance
 from modeler.registration.visibility.sampling import AdaptiveSampler, GaussianMixture
+from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequence
 from modeler.types import (
     AbstractPoseDensity,
     Array,
@@ -33,7 +34,6 @@ from modeler.types import (
     Solution,
     Step,
 )
-from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence
 
 
 def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:

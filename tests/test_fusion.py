@@ -15,13 +15,13 @@ from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 from modeler import se3
 from modeler.fusion import Fuser, IncrementalTsdf, meshing
 from modeler.rays import Sensor
+from modeler.sequences.bop import BopSequence
 from modeler.types import (
     Frame,
     InputError,
     ObjectModel,
     RayImage,
 )
-from sequences.bop import BopSequence
 
 VOXEL_M = 0.0025
 FUSER = Fuser(voxel_m=VOXEL_M)

@@ -18,8 +18,8 @@ from PIL import Image
 from modeler.cli.jobs import NOTES
 from modeler.cli.models import THUMBNAIL_PX
 from modeler.export.models_table import enclosed_m3, read_table
-from sequences.rendering.meshes import Mesh
-from sequences.rendering.shapes import Box
+from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.rendering.shapes import Box
 
 COUNT = 1000
 browser = pytest.mark.skipif(chromium.EXECUTABLE is None, reason="Chromium is not installed")

@@ -30,7 +30,7 @@ from modeler.types import (
     loops_closed,
 )
 from modeler.types.chains import Chains
-from viz.report.run_data import Result
+from modeler.viz.report.run_data import Result
 
 COUNT = 8
 

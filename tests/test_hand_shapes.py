@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from modeler import se3
+from modeler.sequences import open_sequence, write_bop
+from modeler.sequences.base import AbstractDerived
+from modeler.sequences.hand_shapes import HandMarkedSequence, HandShape
 from modeler.types import Camera, Frame, HandPoses, InputError
-from sequences import open_sequence, write_bop
-from sequences.base import AbstractDerived
-from sequences.hand_shapes import HandMarkedSequence, HandShape
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 FINGER = HandShape(np.array([[[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]]), np.array([0.02]), 0.005)

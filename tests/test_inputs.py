@@ -16,8 +16,8 @@ from small_scene import CAMERA, INDICES
 
 from modeler import se3
 from modeler.cli import main
+from modeler.sequences import AbstractSequence, KeptSequence, bundled, frame_range, open_sequence, write_bop
 from modeler.types import Frame, InputError
-from sequences import AbstractSequence, KeptSequence, bundled, frame_range, open_sequence, write_bop
 
 
 @pytest.fixture(params=WRITERS)

@@ -22,9 +22,9 @@ from rosbags import rosbag1, rosbag2
 from test_inputs_clouds import WRITERS as CLOUDS
 
 from modeler.cli import main
-from sequences import open_sequence
-from sequences.ros import bag
-from sequences.ros.bag import Bag, from_bz2, from_lz4, from_zstd
+from modeler.sequences import open_sequence
+from modeler.sequences.ros import bag
+from modeler.sequences.ros.bag import Bag, from_bz2, from_lz4, from_zstd
 
 MEGABYTE = 1 << 20
 PACKERS: dict[str, Callable[[bytes], bytes]] = {"lz4": lz4.frame.compress, "zstd": bag.zstd.compress}

@@ -10,8 +10,8 @@ import pytest
 from recordings import small_frames
 
 from modeler.cli import main
+from modeler.sequences import Overrides, open_sequence
 from modeler.types import Frame, InputError
-from sequences import Overrides, open_sequence
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from recordings import small_frames
 
 from modeler.cli import main
 from modeler.export import RunFolder
-from sequences import open_sequence, write_bop
-from viz.stream import ends_whole
+from modeler.sequences import open_sequence, write_bop
+from modeler.viz.stream import ends_whole
 
 
 def with_files_of_at_most(size: int, *arguments: str) -> int:

@@ -12,8 +12,8 @@ from fuzz.targets import TARGETS, fresh, tiny, truth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from modeler.sequences import open_sequence, read_noise, survey, write_bop
 from modeler.types import InputError
-from sequences import open_sequence, read_noise, survey, write_bop
 
 INPUTS = 40
 

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from recordings import WRITERS, save, write_open3d, write_tum
 
+from modeler.sequences import Overrides, open_sequence, survey, write_bop
 from modeler.types import Frame, InputError
-from sequences import Overrides, open_sequence, survey, write_bop
 
 
 @pytest.fixture(params=WRITERS)

@@ -16,11 +16,11 @@ from recorded.kinect import calibration
 
 from modeler import se3
 from modeler.cli import main
+from modeler.sequences import Overrides, open_sequence
+from modeler.sequences.input_files import Node
+from modeler.sequences.kinect import KinectSequence, Matroska, colour_from_depth, colour_lens, depth_lens
+from modeler.sequences.lens import Alignment, Lens
 from modeler.types import Camera, InputError
-from sequences import Overrides, open_sequence
-from sequences.input_files import Node
-from sequences.kinect import KinectSequence, Matroska, colour_from_depth, colour_lens, depth_lens
-from sequences.lens import Alignment, Lens
 
 WIDTH, HEIGHT = 320, 288  # NFOV_2X2BINNED
 COLOUR_SIZE = (1280, 720)
@@ -228,7 +228,7 @@ def test_images_larger_than_their_track_are_bounded(tmp_path: Path, monkeypatch:
     container.close()
     stamp = Matroska(tmp_path / "s.mkv").stamps("COLOR")[1][1]
     assert Matroska(tmp_path / "s.mkv").image("COLOR", stamp, "image 1").shape == (240, 320, 3)
-    monkeypatch.setattr("sequences.kinect.MAX_PIXELS", 64 * 48)
+    monkeypatch.setattr("modeler.sequences.kinect.MAX_PIXELS", 64 * 48)
     with pytest.raises(InputError, match=r"s\.mkv: "):
         Matroska(tmp_path / "s.mkv").image("COLOR", stamp, "image 1")
 

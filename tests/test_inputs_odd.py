@@ -15,8 +15,8 @@ from recordings import small_frames, small_truth
 
 from modeler import se3
 from modeler.cli import main
+from modeler.sequences import bundled, open_sequence, write_bop
 from modeler.types import Camera, Frame, Outcome
-from sequences import bundled, open_sequence, write_bop
 
 
 @pytest.fixture(scope="module")

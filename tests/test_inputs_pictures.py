@@ -15,8 +15,8 @@ from PIL import Image
 from recordings import raw_depth, save, write_bundlesdf, write_open3d, write_tum
 from test_inputs_clouds import WRITERS as CLOUDS
 
+from modeler.sequences import open_sequence, survey, write_bop
 from modeler.types import Frame, InputError
-from sequences import open_sequence, survey, write_bop
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3", "", ".pcd", ".ply"])

@@ -23,8 +23,8 @@ from refusal import refused
 
 from modeler.cli import main
 from modeler.regular_files import check_regular, create_regular, read_json, read_regular
+from modeler.sequences import open_sequence, write_bop
 from modeler.types import InputError
-from sequences import open_sequence, write_bop
 
 
 def test_the_folder_of_a_run_is_no_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

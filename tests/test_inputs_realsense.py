@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 
 from modeler.cli import main
 from modeler.export import RunFolder
+from modeler.sequences import CalibratedSequence, NoiseModel, Overrides, open_sequence, survey
+from modeler.sequences.lens import Lens, lens_of_model
+from modeler.sequences.live import AbstractCamera, begin, open_camera
+from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
-from sequences import CalibratedSequence, NoiseModel, Overrides, open_sequence, survey
-from sequences.lens import Lens, lens_of_model
-from sequences.live import AbstractCamera, begin, open_camera
-from sequences.ros.sequence import RosSequence
 
 TURN = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
 SHIFT_M = np.array([0.015, 0.001, 0.002])
@@ -271,8 +271,8 @@ def test_a_camera_of_the_makers_library_is_read_while_it_runs(
     played = context.load_device(str(path))
     with pytest.raises(InputError, match=r"realsense:123: .* 0123456789\."):
         open_camera("123", Overrides(), context)
-    monkeypatch.setattr("sequences.live.PATIENCE_MS", 500)
-    monkeypatch.setattr("sequences.live.FIRST", 4)
+    monkeypatch.setattr("modeler.sequences.live.PATIENCE_MS", 500)
+    monkeypatch.setattr("modeler.sequences.live.FIRST", 4)
     sequence = open_camera("0123456789", Overrides(), context)
     assert (sequence.name, sequence.depth_unit) == ("Software D455", "0.25 mm (the camera)")
     frames: list[Frame] = []
@@ -305,7 +305,7 @@ def test_recording_a_live_camera_needs_an_end(
 ) -> None:
     camera = StandIn(small_frames(3))
     monkeypatch.setattr(
-        "sequences.open_sequence",
+        "modeler.sequences.open_sequence",
         lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
     )
     assert main(["convert", "realsense:", "--out", str(tmp_path / "bop")]) == 2
@@ -320,7 +320,7 @@ def test_a_camera_that_is_unplugged_leaves_what_it_gave(
 ) -> None:
     camera, out = StandIn(small_frames(3), lasts=3), tmp_path / "out"
     monkeypatch.setattr(
-        "sequences.open_sequence",
+        "modeler.sequences.open_sequence",
         lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
     )
     assert main([command[0], "realsense:", "--out", str(out), *command[1:]]) in (0, 3)

@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.cli import main
+from modeler.sequences import Overrides, open_sequence
+from modeler.sequences.lens import Lens
+from modeler.sequences.ros import messages
+from modeler.sequences.ros.bag import zstd
+from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
-from sequences import Overrides, open_sequence
-from sequences.lens import Lens
-from sequences.ros import messages
-from sequences.ros.bag import zstd
-from sequences.ros.sequence import RosSequence
 
 SUFFIXES = (".bag", ".mcap", ".db3", "")
 

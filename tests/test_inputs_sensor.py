@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from modeler.cli import main
+from modeler.sequences import CalibratedSequence, NoiseModel, bundled, open_sequence, read_noise, write_bop
+from modeler.sequences.noise_calibration import Calibration, borders, calibrate, pooled_px
+from modeler.sequences.noise_model import noise_text, object_distance_m
+from modeler.sequences.rendering.depth_sensor import gaussian_field
+from modeler.sequences.rendering.recipe import load_recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Tabletop
 from modeler.types import Frame, InputError
-from sequences import CalibratedSequence, NoiseModel, bundled, open_sequence, read_noise, write_bop
-from sequences.noise_calibration import Calibration, borders, calibrate, pooled_px
-from sequences.noise_model import noise_text, object_distance_m
-from sequences.rendering.depth_sensor import gaussian_field
-from sequences.rendering.recipe import load_recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Tabletop
 
 FRAMES = 5
 MODEL = NoiseModel(0.5, 500.0, 1e-4, (3e-6, 4e-7, 1e-8))

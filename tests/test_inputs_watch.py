@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from recordings import small_frames, write_bundlesdf, write_tum
 
+from modeler.sequences import BopSequence, WatchLimits, open_sequence, watch, write_bop
 from modeler.types import Frame, InputError
-from sequences import BopSequence, WatchLimits, open_sequence, watch, write_bop
 
 QUICK = WatchLimits(idle_s=1.0, settle_s=0.2, first=2)
 

@@ -22,8 +22,8 @@ from modeler.export import Pairs, Remembered, RunFolder, RunMeta, alone
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar
+from modeler.sequences import bundled, open_sequence
 from modeler.types import AbstractPoseDensity, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
-from sequences import bundled, open_sequence
 
 BOX = str(bundled("box"))
 QUICK = ("--prior", "table", "--method", "icp", "--frames", "0:3")

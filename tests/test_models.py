@@ -17,8 +17,8 @@ from modeler import fusion, se3
 from modeler.experiment import Modelled, ModelScore, model_scores
 from modeler.fusion import Fuser, Matcher
 from modeler.rays import Sensor
+from modeler.sequences import bundled, open_sequence, true_mesh
 from modeler.types import Array, InputError
-from sequences import bundled, open_sequence, true_mesh
 
 BOX = bundled("box")
 FUSER = Fuser(voxel_m=0.003)

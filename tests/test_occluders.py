@@ -24,8 +24,8 @@ from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene, Segmenter
+from modeler.sequences import BopSequence, open_sequence, write_bop
 from modeler.types import BoolArray, Frame, InputError, Outcome
-from sequences import BopSequence, open_sequence, write_bop
 
 
 def rod(frame: Frame, column: int) -> BoolArray:

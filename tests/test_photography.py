@@ -13,14 +13,14 @@ from scipy.ndimage import map_coordinates
 from trimesh.visual.texture import TextureVisuals
 
 from modeler import se3
+from modeler.sequences.rendering.charts import Chart, Cylindrical, Faces, Spherical, Unwrapped
+from modeler.sequences.rendering.labels import Embedded, Label, Picture, Print, gamma_coded, linear_light
+from modeler.sequences.rendering.photography import Lamp, Photography, SmoothNormals
+from modeler.sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.shapes import AnyShape, Box, Cylinder, MeshFile, Sphere
+from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.types import Array, InputError
-from sequences.rendering.charts import Chart, Cylindrical, Faces, Spherical, Unwrapped
-from sequences.rendering.labels import Embedded, Label, Picture, Print, gamma_coded, linear_light
-from sequences.rendering.photography import Lamp, Photography, SmoothNormals
-from sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import AnyShape, Box, Cylinder, MeshFile, Sphere
-from sequences.rendering.trajectory import Place, Places
 
 VIEW = Viewpoint(160, 120, 287.5, 0.6, look_height_m=0.05)
 STEADY = Photography(highlight=0.0, exposure_sigma=0.0, white_balance_sigma=0.0, noise_levels=0.0, samples=1)

@@ -18,11 +18,11 @@ from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility import photometric as colours
 from modeler.se3 import rows
+from modeler.sequences import bundled, open_sequence
+from modeler.sequences.rendering.recipe import load_recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.types import Array, Camera, Frame, InputError, Outcome, Posterior, RayImage
-from sequences import bundled, open_sequence
-from sequences.rendering.recipe import load_recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Place, Places
 
 TURN_DEG = 24.0
 Views = tuple[RayImage, RayImage]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from viz.report.mesh import look_at, shade
+from modeler.viz.report.mesh import look_at, shade
 
 SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])  # counter-clockwise from above

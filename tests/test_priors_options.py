@@ -32,8 +32,8 @@ from modeler.priors import (
     TurntablePrior,
     VelocityPrior,
 )
+from modeler.sequences import AbstractSequence, bundled
 from modeler.types import Array, Frame, SensorNoise
-from sequences import AbstractSequence, bundled
 
 OWN = """
 from dataclasses import dataclass

@@ -10,8 +10,8 @@ from modeler.evaluation import about_point, true_motion
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Camera, Frame
-from sequences.rendering.renderer import RenderedSequence
 
 CAMERA = Camera(width=320, height=480, fx=575.0, fy=575.0, cx=159.5, cy=239.5)
 AXIS_M, RADIUS_M, HALF_M = 0.8, 0.009, 0.12

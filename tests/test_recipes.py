@@ -12,11 +12,10 @@ from refusal import refused
 from slow import sampled
 
 from modeler import se3
-from modeler.types import InputError
-from sequences.rendering.meshes import Mesh, outer_surface, ply_bytes
-from sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import (
+from modeler.sequences.rendering.meshes import Mesh, outer_surface, ply_bytes
+from modeler.sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.shapes import (
     AnyShape,
     Box,
     Capsule,
@@ -31,7 +30,8 @@ from sequences.rendering.shapes import (
     Torus,
     ear_clipped,
 )
-from sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop, Turntable
+from modeler.sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop, Turntable
+from modeler.types import InputError
 
 
 @pytest.mark.parametrize("name", sampled(recipe_names(), every=12))

@@ -18,7 +18,7 @@ from modeler.registration.visibility.likelihood import MatchNoise
 from modeler.registration.visibility.refinement import Refiner, shrunk, visible_share
 from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
-from sequences import bundled, open_sequence
+from modeler.sequences import bundled, open_sequence
 
 
 def bundled_pair(name):

@@ -10,9 +10,8 @@ import pytest
 from calibration.specimens import load_specimen
 
 from modeler import se3
-from modeler.types import Camera, Frame, InputError
-from sequences import bundled, open_sequence
-from sequences.rendering.depth_sensor import (
+from modeler.sequences import bundled, open_sequence
+from modeler.sequences.rendering.depth_sensor import (
     EXACT,
     DepthSensor,
     DisparityNoise,
@@ -23,11 +22,12 @@ from sequences.rendering.depth_sensor import (
     RandomLoss,
     gaussian_field,
 )
-from sequences.rendering.meshes import Mesh
-from sequences.rendering.recipe import Mosaic, Recipe, Table, Viewpoint, Wall, load_recipe
-from sequences.rendering.renderer import RenderedSequence, render
-from sequences.rendering.shapes import AnyShape, Box, Compound, Part, Sphere
-from sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop
+from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.rendering.recipe import Mosaic, Recipe, Table, Viewpoint, Wall, load_recipe
+from modeler.sequences.rendering.renderer import RenderedSequence, render
+from modeler.sequences.rendering.shapes import AnyShape, Box, Compound, Part, Sphere
+from modeler.sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop
+from modeler.types import Camera, Frame, InputError
 
 SMALL = Viewpoint(160, 120, 144.0)
 NAMES = ("box", "flashlight", "tube", "mug", "figurine", "two_fold", "l_bracket", "held")

@@ -25,15 +25,15 @@ from modeler.export.formats import mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.fusion import Symmetries
 from modeler.fusion.symmetries import Axis
+from modeler.sequences import bundled
 from modeler.types import Array, InputError
-from sequences import bundled
-from viz import entities, reader
-from viz.report import run_data, write_page
-from viz.report.evidence import CHECKS
-from viz.report.mesh import read_mesh, scene
-from viz.report.run_data import Result, recorded, surfaces
-from viz.report.symmetries import rotation_words
-from viz.stream import open_stream
+from modeler.viz import entities, reader
+from modeler.viz.report import run_data, write_page
+from modeler.viz.report.evidence import CHECKS
+from modeler.viz.report.mesh import read_mesh, scene
+from modeler.viz.report.run_data import Result, recorded, surfaces
+from modeler.viz.report.symmetries import rotation_words
+from modeler.viz.stream import open_stream
 
 TRUTH = {k: se3.inverse(object_from_camera(k)) for k in range(COUNT)}
 ODD_NAME = 'a <b> & "c"'
@@ -78,9 +78,11 @@ def _read_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave plots, the picture of the mesh and its symmetries blank, which take most of the time of a page."""
-    monkeypatch.setattr("viz.report.plots._svg", lambda figure: b"<svg xmlns='http://www.w3.org/2000/svg'></svg>")
-    monkeypatch.setattr("viz.report.page.portrait", lambda mesh, object_from_upright, size: b"")
-    monkeypatch.setattr("viz.report.page.symmetry_section", lambda mesh, report: [])
+    monkeypatch.setattr(
+        "modeler.viz.report.plots._svg", lambda figure: b"<svg xmlns='http://www.w3.org/2000/svg'></svg>"
+    )
+    monkeypatch.setattr("modeler.viz.report.page.portrait", lambda mesh, object_from_upright, size: b"")
+    monkeypatch.setattr("modeler.viz.report.page.symmetry_section", lambda mesh, report: [])
 
 
 class Elements(HTMLParser):

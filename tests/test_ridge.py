@@ -17,11 +17,11 @@ from modeler.registration.visibility import ridge
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.ridge import reliability, without_chance
 from modeler.segmentation import Segmenter
+from modeler.sequences import bundled, open_sequence
+from modeler.sequences.rendering.recipe import load_recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.types import Array, RayImage
-from sequences import bundled, open_sequence
-from sequences.rendering.recipe import load_recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Place, Places
 
 BASIN: Final = np.repeat([0.2, 0.01], 3)
 

@@ -20,8 +20,8 @@ from modeler.registration.visibility.noise import nonnegative_solution, signific
 from modeler.registration.visibility.points import OWN_RIM
 from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
+from modeler.sequences import bundled, open_sequence
 from modeler.types import Array, RayImage
-from sequences import bundled, open_sequence
 
 BLUR_M: Final = 0.001
 

@@ -15,9 +15,9 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration.visibility import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.search import Candidates, Search
+from modeler.sequences import bundled, open_sequence
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Outcome
-from sequences import bundled, open_sequence
-from sequences.rendering.renderer import RenderedSequence
 
 MIN_OVERLAP = VisibilityRegistrar().min_overlap
 WIDE = GeneralPrior(max_rotation_deg=95.0, max_offset_m=0.08)  # the other way round a box is beyond

@@ -12,7 +12,7 @@ from recordings import small_frames, small_truth, write_open3d
 from sources import SOURCES, nodes
 
 from modeler.cli import main
-from sequences import open_sequence, write_bop
+from modeler.sequences import open_sequence, write_bop
 
 EVIL = "../../../../evil <script>alert(1)</script>"
 RUNS_CODE = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "torch", "yaml", "runpy", "code"}

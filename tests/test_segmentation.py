@@ -13,8 +13,8 @@ from worlds import CAMERA, OBJECT, World, iou
 
 from modeler.segmentation import Scene, Segmenter
 from modeler.segmentation.depth_images import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks
+from modeler.sequences.bop import BopSequence
 from modeler.types import Camera, Frame, Outcome
-from sequences.bop import BopSequence
 
 
 def turned(count, rng, surround=lambda world, k: world, **camera):

@@ -17,8 +17,8 @@ from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.self_calibration import FocalCalibrator
+from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
 from modeler.types import AbstractPrior, Edge, FocalLength, Outcome, Posterior, RayImage, Stated
-from sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
 
 STEPS = 12
 SENSOR = Sensor(sigma_r_m=1e-3, sigma_focal=0.02)

@@ -16,9 +16,9 @@ from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import Camera, Frame, Outcome, Step
-from sequences.rendering.renderer import RenderedSequence
 
 SHAPE = (120, 160)
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)

@@ -13,15 +13,15 @@ from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.priors import PokePrior, TablePrior
 from modeler.rays import Sensor
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.candidates import poked, pokes
 from modeler.suggestion.edge_prediction import TURNS_RAD, basins
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
 from modeler.suggestion.surface_cells import enclosing_circle
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Stated
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Place, Places
 
 
 def edge(source: int, target: int, mean: Array, sigma_rad: float, rng: np.random.Generator) -> Edge:

@@ -24,6 +24,11 @@ from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Scene
+from modeler.sequences.rendering.depth_sensor import DepthSensor
+from modeler.sequences.rendering.recipe import Recipe, Table, TurnedOver, Viewpoint
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.shapes import Box, Capsule, Compound, Part, Sphere
+from modeler.sequences.rendering.trajectory import Tabletop
 from modeler.types import (
     Array,
     Edge,
@@ -40,11 +45,6 @@ from modeler.types import (
     segments,
 )
 from modeler.verdict.evidence import other_modes
-from sequences.rendering.depth_sensor import DepthSensor
-from sequences.rendering.recipe import Recipe, Table, TurnedOver, Viewpoint
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import Box, Capsule, Compound, Part, Sphere
-from sequences.rendering.trajectory import Tabletop
 
 LOPSIDED = Compound(
     (

@@ -12,8 +12,8 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
+from modeler.sequences import bundled, open_sequence
 from modeler.types import Camera, Frame, Outcome
-from sequences import bundled, open_sequence
 
 
 @pytest.fixture(scope="module")

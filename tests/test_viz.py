@@ -23,10 +23,10 @@ from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, steps
 from modeler import se3
 from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Failed, Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
-from viz import blueprint, entities, graph_view, images, model_view, pair_view
-from viz.pose_table import pose_table
-from viz.readings import sd_of
-from viz.stream import graph_due, open_stream
+from modeler.viz import blueprint, entities, graph_view, images, model_view, pair_view
+from modeler.viz.pose_table import pose_table
+from modeler.viz.readings import sd_of
+from modeler.viz.stream import graph_due, open_stream
 
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
 GHOSTS = (entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS)

@@ -14,7 +14,7 @@ from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, object_from_c
 
 from modeler import se3
 from modeler.types import Mode, Plane, PoseGaussian, Step, loop_opening
-from viz import entities, images, pair_view, readings
+from modeler.viz import entities, images, pair_view, readings
 
 
 def test_alignment_brings_the_pair_together(recording: Recording) -> None:

@@ -25,8 +25,8 @@ from streamed import read, record
 from turning_box import COUNT
 
 from modeler.types import Step
-from viz import entities, viewer
-from viz.stream import RerunStream, open_stream
+from modeler.viz import entities, viewer
+from modeler.viz.stream import RerunStream, open_stream
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -121,8 +121,8 @@ def test_a_viewer_that_is_already_open_may_be_closed_while_the_run_goes_on(run: 
 def test_a_viewer_that_freezes_does_not_stop_the_run(
     run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("viz.stream._PATIENCE_S", 0.5)
-    monkeypatch.setattr("viz.viewer._STOP_S", 0.2)
+    monkeypatch.setattr("modeler.viz.stream._PATIENCE_S", 0.5)
+    monkeypatch.setattr("modeler.viz.viewer._STOP_S", 0.2)
     stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     stream(run[0])
     stream.viewers[0].process.send_signal(signal.SIGSTOP)
@@ -153,14 +153,14 @@ class SlowDisk:
 def test_a_recording_is_waited_for_as_long_as_it_grows(
     watched: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(f"viz.stream.{'_PATIENCE_S' if watched else '_DISK_PATIENCE_S'}", 0.2)
+    monkeypatch.setattr(f"modeler.viz.stream.{'_PATIENCE_S' if watched else '_DISK_PATIENCE_S'}", 0.2)
     recording: Any = SlowDisk(tmp_path / "r.rrd")
     RerunStream(recording, (), 0.0, recording.file, watched=watched).close()
     assert recording.file.read_bytes() == b"whole"
 
 
 def test_a_disk_that_hangs_does_not_hold_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("viz.stream._DISK_PATIENCE_S", 0.2)
+    monkeypatch.setattr("modeler.viz.stream._DISK_PATIENCE_S", 0.2)
     released = threading.Event()
     recording: Any = SimpleNamespace(disconnect=released.wait)
     (tmp_path / "r.rrd").write_bytes(b"half")
@@ -248,7 +248,8 @@ def test_a_recording_is_viewed_in_the_browser(run: list[Step], tmp_path: Path) -
 def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp_path: Path, number: int) -> None:
     record(tmp_path / "recording.rrd", run[:1])
     program = (
-        "import sys, pathlib, signal; from viz import viewer; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "import sys, pathlib, signal; from modeler.viz import viewer;"
+        "signal.signal(signal.SIGINT, signal.default_int_handler);"
         "served = viewer.view(pathlib.Path(sys.argv[1]), web=True);"
         "print(served.process.pid, flush=True); served.wait()"
     )
@@ -266,7 +267,7 @@ def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp
 def test_the_server_ends_with_its_parent_however_that_ends(run: list[Step], tmp_path: Path) -> None:
     record(tmp_path / "recording.rrd", run[:1])
     program = (
-        "import sys, pathlib, time; from viz import viewer;"
+        "import sys, pathlib, time; from modeler.viz import viewer;"
         "print(viewer.view(pathlib.Path(sys.argv[1]), web=True).process.pid, flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
@@ -313,7 +314,7 @@ def processor_s(process: int) -> float:
 def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_path: Path) -> None:
     program = (
         "import sys, pathlib, time; from modeler.cli.console import terminable; from turning_box import steps;"
-        "from viz.stream import open_stream\n"
+        "from modeler.viz.stream import open_stream\n"
         "with terminable():\n"
         "    stream = open_stream('box', save=pathlib.Path(sys.argv[1]), web=True)\n"
         "    try:\n"
@@ -336,7 +337,9 @@ def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_pat
 
 
 def test_rerun_is_not_imported_before_it_is_needed() -> None:
-    program = "import sys, viz.stream, viz.viewer, viz.entities; sys.exit('rerun' in sys.modules)"
+    program = (
+        "import sys, modeler.viz.stream, modeler.viz.viewer, modeler.viz.entities; sys.exit('rerun' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 

@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 
 from modeler.export.standing import upright
 from modeler.types import Array, RayImage
-from viz import entities, graph_view, images
+from modeler.viz import entities, graph_view, images
 
 _BACKGROUND: Final = (24, 26, 30)
 _ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to the eye; the camera is towards -z, up is -y

@@ -12,7 +12,7 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from modeler.types import Array, Posterior, Step
-from viz import entities
+from modeler.viz import entities
 
 Drawing = Iterator[tuple[str, rr.AsComponents]]
 """Entities in the order in which they are logged."""

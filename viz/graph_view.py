@@ -15,9 +15,9 @@ from modeler import se3
 from modeler.export.standing import upright
 from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Array, Camera, Edge, PoseGaussian, Step
-from viz import entities
-from viz.drawings import CLEAR, Drawing, caption, ellipsoids, rounded_down, scale_words
-from viz.pose_table import pose_table
+from modeler.viz import entities
+from modeler.viz.drawings import CLEAR, Drawing, caption, ellipsoids, rounded_down, scale_words
+from modeler.viz.pose_table import pose_table
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 """From the object towards the eye that looks at the whole graph."""

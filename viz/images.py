@@ -17,8 +17,8 @@ from modeler.kernels import point_likelihood as kernel
 from modeler.rays import Sensor
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.types import Array, BoolArray, Frame, RayImage, Step
-from viz import entities
-from viz.drawings import CLEAR, Drawing, shown_posterior
+from modeler.viz import entities
+from modeler.viz.drawings import CLEAR, Drawing, shown_posterior
 
 _PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
 _DEPTH_PIXELS: Final = 100_000

@@ -13,8 +13,8 @@ import rerun as rr
 from modeler import se3
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.types import Array, ObjectModel, Step
-from viz import entities
-from viz.drawings import CLEAR, POINT_SIZE, Drawing, shaded
+from modeler.viz import entities
+from modeler.viz.drawings import CLEAR, POINT_SIZE, Drawing, shaded
 
 _MODEL_POINTS: Final = 15_000
 _TRIANGLES: Final = 60_000

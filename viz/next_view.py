@@ -10,9 +10,9 @@ import rerun.blueprint as rrb
 
 from modeler.suggestion import Belief, Suggestions
 from modeler.types import RayImage
-from viz import entities
-from viz.blueprint import FROM_THE_SIDE, followed
-from viz.drawings import Drawing
+from modeler.viz import entities
+from modeler.viz.blueprint import FROM_THE_SIDE, followed
+from modeler.viz.drawings import Drawing
 
 WORDS: Final = "next/words"
 SEEN_CELLS: Final = "world/cells/seen"

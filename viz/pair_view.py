@@ -14,8 +14,8 @@ import rerun as rr
 from modeler import se3
 from modeler.export.standing import upright
 from modeler.types import Array, Mode, Posterior, RayImage, Step
-from viz import entities
-from viz.drawings import (
+from modeler.viz import entities
+from modeler.viz.drawings import (
     CLEAR,
     POINT_SIZE,
     Drawing,
@@ -26,7 +26,7 @@ from viz.drawings import (
     shaded,
     shown_posterior,
 )
-from viz.readings import worst_axis_sd
+from modeler.viz.readings import worst_axis_sd
 
 _PAIR_POINTS: Final = 6_000
 

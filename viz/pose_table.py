@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from modeler import se3
 from modeler.types import Edge, PoseGaussian, Step
-from viz.readings import Sd, sd_of
+from modeler.viz.readings import Sd, sd_of
 
 
 def pose_table(step: Step, chain: Mapping[int, PoseGaussian], frames: Sequence[int]) -> str:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from PIL import Image
 
-from viz import entities
+from modeler.viz import entities
 
 FRAME_PATHS: Final = (
     entities.COLOUR,
@@ -30,7 +30,7 @@ FRAME_PATHS: Final = (
 """Entities that are shown."""
 READ: Final = (*FRAME_PATHS, entities.PAIR_CAPTION)
 _COMPONENTS: Final = ("blob", "buffer", "format", "positions", "colors", "labels")
-_READER: Final = ("-m", "viz.reader")
+_READER: Final = ("-m", "modeler.viz.reader")
 
 
 @dataclass

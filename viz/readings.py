@@ -12,8 +12,8 @@ import rerun as rr
 from modeler import se3
 from modeler.export.report import undetermined
 from modeler.types import ACCEPTED, Array, Edge, PoseGaussian, Posterior, Step, explain, loop_opening
-from viz import entities
-from viz.drawings import Drawing
+from modeler.viz import entities
+from modeler.viz.drawings import Drawing
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from modeler.address_space import check_room
 from modeler.regular_files import create_regular, open_regular
 from modeler.types import InputError, Step
-from viz import entities, viewer
+from modeler.viz import entities, viewer
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -61,8 +61,8 @@ class RerunStream:
         if not self.recording.is_enabled():
             return
         # Rerun takes half a second to import: only runs that record pay for it.
-        from viz import graph_view, images, model_view, pair_view, readings
-        from viz.drawings import shown_posterior
+        from modeler.viz import graph_view, images, model_view, pair_view, readings
+        from modeler.viz.drawings import shown_posterior
 
         # A lost frame is retried after later ones: the result is logged at the latest frame.
         self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
@@ -92,7 +92,7 @@ class RerunStream:
         """Draw the belief and the suggestions after a step; may be called from another thread."""
         if not self.recording.is_enabled():
             return
-        from viz import next_view
+        from modeler.viz import next_view
 
         self.recording.set_time(entities.FRAME, sequence=max([step.frame.index, *step.views]))
         self.recording.set_time(entities.ELAPSED, duration=time.monotonic() - self.started_s)
@@ -143,7 +143,7 @@ def load() -> None:
     """
     if "rerun" not in sys.modules:
         check_room(_ROOM)
-    from viz import blueprint, drawings, images, readings  # noqa: F401  # pyright: ignore[reportUnusedImport]
+    from modeler.viz import blueprint, drawings, images, readings  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
 
 def open_stream(
@@ -176,7 +176,7 @@ def open_stream(
     load()
     import rerun as rr
 
-    from viz import drawings, images, readings
+    from modeler.viz import drawings, images, readings
 
     listens = connect is not None and viewer.reachable(connect)
     sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [_file_sink(save)]
@@ -208,7 +208,7 @@ def open_stream(
 
 def _layout(first: RayImage | None, *, advised: bool) -> rrb.Blueprint:
     """Return the layout, with a tab for suggestions if they will follow."""
-    from viz import blueprint, next_view
+    from modeler.viz import blueprint, next_view
 
     return blueprint.layout(first, (next_view.tab(first),) if advised else ())
 

@@ -197,7 +197,7 @@ def _run(command: Command) -> int:
     _check_environment()
     check_room(_ROOM)
     with interruptible_at_once():
-        importlib.import_module("viz.viewer" if isinstance(command, View) else "modeler.cli.inputs")
+        importlib.import_module("modeler.viz.viewer" if isinstance(command, View) else "modeler.cli.inputs")
         from modeler.types import InputError
     try:
         with terminable():

@@ -10,9 +10,9 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import AutoPrior, GeneralPrior, TablePrior, TurntablePrior, turntable_in
+from modeler.sequences import AbstractSequence
 from modeler.types import AbstractPrior, Failed, Outcome, Posterior, Reason, advice
 from modeler.verdict.evidence import MAX_UNSURE
-from sequences import AbstractSequence
 
 _SURE_STEPS: Final = 3  # least number of pairs for a measured step
 _FAR_SDS: Final = 3.0  # of the given step, beyond which the measured one contradicts it

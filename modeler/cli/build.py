@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from modeler.export import RunFolder, RunMeta
     from modeler.pipeline import Modeler, Run
     from modeler.segmentation import Scene
+    from modeler.sequences import AbstractSequence
     from modeler.types import AbstractPrior, Event, Frame
-    from sequences import AbstractSequence
 
 DRAWING_SHARE = 0.15
 """Of the time of a live run. Drawing a step takes about as long as registering one; so it delays steps by a fifth."""
@@ -81,7 +81,7 @@ class Build:
         from modeler.cli.outputs import check_run_folder
         from modeler.concurrency import in_parallel
         from modeler.export import Remembered, RunFolder, RunMeta, alone
-        from viz.stream import ends_whole, load
+        from modeler.viz.stream import ends_whole, load
 
         began_s = time.perf_counter()
         _check(self)
@@ -160,7 +160,7 @@ def _check(options: Build) -> None:
         InputError: if they do.
     """
     from modeler.types import InputError
-    from viz.viewer import reachable
+    from modeler.viz.viewer import reachable
 
     if options.resume and options.overwrite:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
@@ -178,8 +178,8 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
         InputError: if something cannot be read.
     """
     from modeler.cli.inputs import calibrated, watched
+    from modeler.sequences import KeptSequence, Overrides, frame_range, open_sequence, survey
     from modeler.types import InputError
-    from sequences import KeptSequence, Overrides, frame_range, open_sequence, survey
 
     path, overrides = options.sequence, Overrides(strict_paths=options.model.strict_paths)
     whole = watched(path, overrides, options.idle_s) if options.watch else open_sequence(path, overrides)
@@ -214,7 +214,7 @@ def _run(
     from modeler.cli.live_advice import advising
     from modeler.concurrency import in_background
     from modeler.types import Step
-    from viz.stream import open_stream
+    from modeler.viz.stream import open_stream
 
     frames, scene = seen
     stream = open_stream(

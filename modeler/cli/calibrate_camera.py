@@ -52,8 +52,8 @@ class CalibrateCamera:
         from modeler.cli.outputs import check_files, run_inputs
         from modeler.export import write_atomically
         from modeler.self_calibration import FocalCalibrator
+        from modeler.sequences import FocalFactor
         from modeler.types import InputError
-        from sequences import FocalFactor
 
         check_files([self.out], run_inputs([self.run_folder], self.moved.sequence), overwrite=self.overwrite)
         run = reopened(self.run_folder, self.moved.sequence)

@@ -13,7 +13,7 @@ from modeler.cli.console import say
 from modeler.cli.options import InputOptions
 
 if TYPE_CHECKING:
-    from sequences.noise_calibration import Calibration
+    from modeler.sequences.noise_calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class CalibrateSensor:
         from modeler.cli.inputs import reading
         from modeler.cli.outputs import check_files
         from modeler.export import write_atomically
-        from sequences import open_sequence
-        from sequences.noise_calibration import calibrate
-        from sequences.noise_model import noise_text, object_distance_m
+        from modeler.sequences import open_sequence
+        from modeler.sequences.noise_calibration import calibrate
+        from modeler.sequences.noise_model import noise_text, object_distance_m
 
         check_files([self.out], [self.input], overwrite=self.overwrite)
         sequence = open_sequence(self.input, self.given.overrides())

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.priors import Poke as Push
+from modeler.sequences.input_files import Node, read_text, read_tree
+from modeler.sequences.rendering.recipe import build
 from modeler.suggestion import Candidate
 from modeler.types import Array, InputError
-from sequences.input_files import Node, read_text, read_tree
-from sequences.rendering.recipe import build
 
 _COLUMNS = ("name", "cost", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _MOST = 1000  # 25 s; a robot's list is shorter

@@ -95,7 +95,7 @@ def _prepared() -> tuple[Modeler, list[RayImage], dict[int, Array]]:
     """Return a modeler, two views of a bundled sequence, and its true object_from_camera (4, 4)."""
     from modeler import se3
     from modeler.pipeline import Modeler
-    from sequences import bundled, open_sequence
+    from modeler.sequences import bundled, open_sequence
 
     sequence, modeler = open_sequence(bundled("box")), Modeler()
     frames = [sequence.frame(index) for index in sequence.indices[:2]]

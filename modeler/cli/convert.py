@@ -13,7 +13,7 @@ from modeler.cli.console import say
 from modeler.cli.options import FrameOptions, InputOptions, default
 
 if TYPE_CHECKING:
-    from sequences import AbstractSequence
+    from modeler.sequences import AbstractSequence
 
 UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)
 """Depth is written in the finest of these in which it fits into 16 bits."""
@@ -51,8 +51,8 @@ class Convert:
         from modeler.cli.inputs import calibrated, reading, while_it_lasts
         from modeler.cli.outputs import check_files, check_folder, run_inputs
         from modeler.regular_files import read_regular
+        from modeler.sequences import frame_range, open_sequence, survey, write_bop
         from modeler.types import InputError
-        from sequences import frame_range, open_sequence, survey, write_bop
 
         if (self.input / "report.json").is_file():
             if self.sensor or self.camera or self.selection != FrameOptions() or self.given != InputOptions():
@@ -116,8 +116,8 @@ def _poses(run: Path, out: Path) -> int:
     """
     from modeler import se3
     from modeler.export import RunFolder, poses_of, tum_text, write_atomically
+    from modeler.sequences.bop import pose_entry
     from modeler.types import InputError
-    from sequences.bop import pose_entry
 
     report = RunFolder(run).result()
     poses = {frame: pose.mean for frame, pose in poses_of(report).items()}

@@ -15,9 +15,9 @@ from modeler.cli.options import SEED, default
 
 if TYPE_CHECKING:
     from modeler.pipeline import Modeler
+    from modeler.sequences.rendering.recipe import Recipe
     from modeler.suggestion import Goal, Suggestion, Suggestions
     from modeler.types import Step
-    from sequences.rendering.recipe import Recipe
 
 _REACH_DEG = 100.0  # of turns, and limit of the table prior: beyond it views hardly share surface
 
@@ -63,10 +63,10 @@ class DemoActive:
         from modeler.pipeline import Modeler
         from modeler.priors import TablePrior
         from modeler.rays import Sensor
+        from modeler.sequences.rendering.recipe import load_recipe
         from modeler.suggestion import Goal
         from modeler.types import InputError
-        from sequences.rendering.recipe import load_recipe
-        from viz.stream import open_stream
+        from modeler.viz.stream import open_stream
 
         if not (1 <= self.actions <= 100 and 0.0 < self.until_seen <= 1.0 and self.until_pose_deg > 0.0):
             raise InputError(
@@ -75,7 +75,7 @@ class DemoActive:
         check_folder(self.out, [Path(self.shape)])
         recipe = replace(load_recipe(self.shape), seed=self.seed)
         compile_kernels()
-        from sequences.rendering.renderer import RenderedSequence
+        from modeler.sequences.rendering.renderer import RenderedSequence
 
         sensor = Sensor(*RenderedSequence(recipe).sensor())
         modeler = Modeler(sensor=sensor, prior=TablePrior(max_rotation_deg=_REACH_DEG), seed=self.seed)
@@ -113,10 +113,10 @@ class _Demo:
     def run(self, recipe: Recipe, actions: int, rng: Any) -> tuple[Mapping[str, Any], bool]:
         """Return the report of the run, and whether the goal was reached."""
         from modeler.cli.simulated_robot import SimulatedRobot
+        from modeler.sequences import write_bop
         from modeler.suggestion import suggest
         from modeler.types import Step
-        from sequences import write_bop
-        from viz import next_view
+        from modeler.viz import next_view
 
         began_s = time.perf_counter()
         robot, done, reached = SimulatedRobot.before(recipe), "the first view", False

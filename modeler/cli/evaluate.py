@@ -17,9 +17,9 @@ from modeler.cli.options import OF_EXTRAS, SEED, FrameOptions, Method, ObjectOpt
 if TYPE_CHECKING:
     from modeler.cli.inputs import Part
     from modeler.experiment import ModelScore, Pairing, Summary
+    from modeler.sequences import AbstractSequence
+    from modeler.sequences.rendering.meshes import Mesh
     from modeler.types import AbstractRegistrar, Array
-    from sequences import AbstractSequence
-    from sequences.rendering.meshes import Mesh
 
 _SAME_M = 1e-5  # to which files of one surface agree
 
@@ -102,8 +102,8 @@ def _evaluate_pairs(options: Evaluate) -> int:
     from modeler import experiment
     from modeler.cli import compose
     from modeler.experiment import Experiment, Pairing
-    from sequences import Overrides, frame_range, open_sequence
-    from viz import figures
+    from modeler.sequences import Overrides, frame_range, open_sequence
+    from modeler.viz import figures
 
     kept, overrides = frame_range(options.selection.frames), Overrides(strict_paths=options.strict_paths)
     recorded = [open_sequence(path, overrides).select(options.selection.every, kept) for path in options.sequences]
@@ -284,8 +284,8 @@ def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
     Raises:
         InputError: if a part of the run does not know them, or parts that were joined know different surfaces.
     """
+    from modeler.sequences import true_mesh
     from modeler.types import InputError
-    from sequences import true_mesh
 
     poses: dict[int, Array] = {}
     meshes: list[Mesh] = []

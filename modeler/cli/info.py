@@ -11,8 +11,8 @@ import tyro
 from modeler.cli.options import InputOptions
 
 if TYPE_CHECKING:
+    from modeler.sequences import AbstractSequence, Survey
     from modeler.types import Camera
-    from sequences import AbstractSequence, Survey
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Info:
         from json import dumps
 
         from modeler.cli.inputs import reading
-        from sequences import open_sequence, survey
+        from modeler.sequences import open_sequence, survey
 
         sequence = open_sequence(self.input, self.given.overrides())
         with reading() as watched:
@@ -75,7 +75,7 @@ def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
 
 def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
     """Return the results as (name, words)."""
-    from sequences.base import span
+    from modeler.sequences.base import span
 
     total = len(found.indices)
     low, middle, high = found.range_m

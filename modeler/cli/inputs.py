@@ -20,8 +20,7 @@ from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.rays import Sensor
 from modeler.segmentation import Scene
-from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
-from sequences import (
+from modeler.sequences import (
     AbstractSequence,
     CalibratedSequence,
     Overrides,
@@ -32,7 +31,8 @@ from sequences import (
     read_noise,
     watch,
 )
-from sequences.base import AbstractDerived
+from modeler.sequences.base import AbstractDerived
+from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
 _ALIKE = 0.02  # largest relative change of an object's number of points between versions of a library

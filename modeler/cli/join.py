@@ -166,7 +166,7 @@ def _written(
     from modeler.fusion import Fuser, conditional_covariances
     from modeler.types import Solution
     from modeler.verdict import FrameRecord
-    from viz.stream import open_stream
+    from modeler.viz.stream import open_stream
 
     views = dict(parts[0].views) | dict(parts[1].views)
     model = Fuser().fuse(views, solution.trajectory, conditional_covariances(solution, graph.edges))

@@ -53,7 +53,7 @@ def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
     Raises:
         InputError: if it cannot be read, a column is unknown, or a row's options cannot be used.
     """
-    from sequences.input_files import read_text
+    from modeler.sequences.input_files import read_text
 
     try:
         lines = csv.DictReader(io.StringIO(read_text(path, "CSV"), newline=""), strict=True)

@@ -53,7 +53,7 @@ def _errors(run: Path, report: dict[str, Any], centre_m: Array) -> dict[str, flo
 def thumbnail_of(run: Path, out: Path) -> None:
     """Write a small picture of the model of a run, if it has one."""
     from modeler.export import model_upright
-    from viz.report.mesh import portrait, read_mesh
+    from modeler.viz.report.mesh import portrait, read_mesh
 
     mesh = read_mesh(run / "model.ply")
     if mesh is not None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from sequences import Overrides
+    from modeler.sequences import Overrides
 
 
 def default(text: str) -> object:
@@ -253,7 +253,7 @@ class InputOptions:
         Raises:
             InputError: if one cannot be.
         """
-        from sequences import Overrides
+        from modeler.sequences import Overrides
 
         return Overrides(**asdict(self))
 

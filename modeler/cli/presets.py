@@ -26,8 +26,8 @@ from modeler.export.checks import Checks, loaded, mesh_checks
 from modeler.export.standing import model_up
 from modeler.export.texture import TRIANGLES, Texture
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
+from modeler.sequences import write_bop
 from modeler.types import Array, InputError, ObjectModel
-from sequences import write_bop
 
 _FILES: Final = {"foundationpose": ".obj", "print": ".stl"}
 _PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices carry the colours
@@ -278,7 +278,7 @@ class Preset:
 
     def _reads_back(self, scenes: dict[str, dict]) -> bool:
         """Return whether the scenes are read with a pose and a mask for every frame."""
-        from sequences import open_sequence
+        from modeler.sequences import open_sequence
 
         for name, views in scenes.items():
             sequence = open_sequence(self.options.out / "onboarding_static" / name)

@@ -37,8 +37,8 @@ class Register:
         from modeler.cli import compose
         from modeler.cli.advice import outcome_advice
         from modeler.export import edge_record
+        from modeler.sequences import Overrides, open_sequence
         from modeler.types import Edge, InputError, Solution, Stated
-        from sequences import Overrides, open_sequence
 
         if self.source == self.target:
             raise InputError(f"SOURCE and TARGET are both frame {self.source}; name two frames")

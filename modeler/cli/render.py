@@ -26,8 +26,8 @@ class Render:
         """Render the sequence."""
         from modeler.cli.inputs import reading
         from modeler.cli.outputs import check_folder
-        from sequences.rendering.recipe import load_recipe
-        from sequences.rendering.renderer import render
+        from modeler.sequences.rendering.recipe import load_recipe
+        from modeler.sequences.rendering.renderer import render
 
         check_folder(self.out, [Path(self.recipe)])
         recipe = load_recipe(self.recipe)

@@ -37,7 +37,7 @@ class Report:
         from modeler.export import RunFolder
         from modeler.export.run_folder import PAGE
         from modeler.types import InputError
-        from viz.report import write_page
+        from modeler.viz.report import write_page
 
         out = self.run_folder / PAGE if self.out is None else self.out
         inputs = run_inputs([self.run_folder], self.moved.sequence)

@@ -7,9 +7,9 @@ from typing import Final, final
 
 import numpy as np
 
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.stage import Stage
 from modeler.suggestion import Belief, Candidate
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.stage import Stage
 
 TURN_SIGMA_DEG: Final = 2.0
 """Standard deviation of its turns: about that of a person with a mark to turn by."""

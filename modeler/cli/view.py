@@ -22,7 +22,7 @@ class View:
 
     def run(self) -> int:
         """Open the viewer; in the browser, wait until the user is done."""
-        from viz import viewer
+        from modeler.viz import viewer
 
         opened = viewer.view(self.run_folder, web=self.web)
         if self.web:

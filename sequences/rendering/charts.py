@@ -7,8 +7,8 @@ from typing import final
 
 import numpy as np
 
+from modeler.sequences.rendering.meshes import IntArray, Mesh
 from modeler.types import Array, InputError
-from sequences.rendering.meshes import IntArray, Mesh
 
 STEEP = np.sqrt(0.5)
 """Surface tilted from upright by more than 45 degrees counts as facing up or down."""

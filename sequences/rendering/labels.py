@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from modeler.sequences.image_files import read_colour
+from modeler.sequences.rendering.charts import AnyWrap, Chart, Cylindrical, Surfels
+from modeler.sequences.rendering.meshes import Mesh
 from modeler.types import Array, BoolArray, Float32Array, InputError
-from sequences.image_files import read_colour
-from sequences.rendering.charts import AnyWrap, Chart, Cylindrical, Surfels
-from sequences.rendering.meshes import Mesh
 
 Rgb = npt.NDArray[np.uint8]
 

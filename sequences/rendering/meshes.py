@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.regular_files import read_regular
+from modeler.sequences.image_files import MAX_PIXELS
 from modeler.types import Array, BoolArray, InputError
-from sequences.image_files import MAX_PIXELS
 
 if TYPE_CHECKING:
     import open3d as o3d

@@ -11,10 +11,10 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 
 from modeler import se3
+from modeler.sequences.rendering.charts import Surfels
+from modeler.sequences.rendering.labels import LabelledMesh, gamma_coded, linear_light
+from modeler.sequences.rendering.meshes import Hits, IntArray, Mesh
 from modeler.types import Array, BoolArray
-from sequences.rendering.charts import Surfels
-from sequences.rendering.labels import LabelledMesh, gamma_coded, linear_light
-from sequences.rendering.meshes import Hits, IntArray, Mesh
 
 _CREASE = np.cos(np.radians(30.0))
 """Triangles that meet at more than 30 degrees meet at an edge; others are facets of a round surface."""

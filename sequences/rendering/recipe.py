@@ -11,13 +11,13 @@ from typing import Literal, final
 
 import numpy as np
 
+from modeler.sequences.input_files import Node, read_tree
+from modeler.sequences.rendering.depth_sensor import DepthSensor
+from modeler.sequences.rendering.labels import Label
+from modeler.sequences.rendering.photography import Photography
+from modeler.sequences.rendering.shapes import AnyShape
+from modeler.sequences.rendering.trajectory import AnyTrajectory, Tabletop
 from modeler.types import Array, Camera, InputError
-from sequences.input_files import Node, read_tree
-from sequences.rendering.depth_sensor import DepthSensor
-from sequences.rendering.labels import Label
-from sequences.rendering.photography import Photography
-from sequences.rendering.shapes import AnyShape
-from sequences.rendering.trajectory import AnyTrajectory, Tabletop
 
 
 def build(annotation: object, node: Node) -> typing.Any:

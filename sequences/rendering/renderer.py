@@ -13,16 +13,16 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.sequences.base import AbstractSequence, span
+from modeler.sequences.bop import write_bop
+from modeler.sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
+from modeler.sequences.rendering.labels import LabelledMesh
+from modeler.sequences.rendering.meshes import Caster, Hits, Mesh, outer_surface, ply_bytes
+from modeler.sequences.rendering.photography import LitMesh, Photography
+from modeler.sequences.rendering.recipe import Mosaic, Recipe
+from modeler.sequences.rendering.shapes import Box, placement
+from modeler.sequences.rendering.trajectory import Hand
 from modeler.types import Array, Camera, Frame, InputError, SensorNoise
-from sequences.base import AbstractSequence, span
-from sequences.bop import write_bop
-from sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
-from sequences.rendering.labels import LabelledMesh
-from sequences.rendering.meshes import Caster, Hits, Mesh, outer_surface, ply_bytes
-from sequences.rendering.photography import LitMesh, Photography
-from sequences.rendering.recipe import Mosaic, Recipe
-from sequences.rendering.shapes import Box, placement
-from sequences.rendering.trajectory import Hand
 
 _WALL_THICKNESS_M = 0.05
 

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.sequences.rendering.meshes import IntArray, Mesh, read_mesh
 from modeler.types import Array, BoolArray
-from sequences.rendering.meshes import IntArray, Mesh, read_mesh
 
 
 def turned(profile_m: Array, sides: int) -> Mesh:

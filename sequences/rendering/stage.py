@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.types import Array, Frame
-from sequences.rendering.meshes import Mesh
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Place, Places
 
 
 @final

@@ -15,8 +15,8 @@ from typing import final
 import numpy as np
 
 from modeler import se3
+from modeler.sequences.rendering.shapes import placement
 from modeler.types import Array
-from sequences.rendering.shapes import placement
 
 
 @final

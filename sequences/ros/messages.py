@@ -9,11 +9,11 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, read_depth
+from modeler.sequences.intrinsics import sane
+from modeler.sequences.lens import Lens, lens_of_model
+from modeler.sequences.ros.bag import MAX_BYTES, from_zstd
 from modeler.types import Camera, InputError
-from sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, read_depth
-from sequences.intrinsics import sane
-from sequences.lens import Lens, lens_of_model
-from sequences.ros.bag import MAX_BYTES, from_zstd
 
 IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 MILLIMETRES = ("16UC1", "mono16")

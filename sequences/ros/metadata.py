@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.sequences.intrinsics import sane
+from modeler.sequences.lens import Lens, lens_of_model
+from modeler.sequences.ros.bag import Bag
 from modeler.types import Array, Camera, InputError
-from sequences.intrinsics import sane
-from sequences.lens import Lens, lens_of_model
-from sequences.ros.bag import Bag
 
 STATIC = "tf2_msgs/msg/TFMessage"
 FARTHEST_M = 1e4

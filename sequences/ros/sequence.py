@@ -11,13 +11,18 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.sequences.intrinsics import Overrides
+from modeler.sequences.lens import Alignment, Lens
+from modeler.sequences.recording import AbstractStreams, paired
+from modeler.sequences.ros import messages
+from modeler.sequences.ros.bag import Bag, Stamp
+from modeler.sequences.ros.metadata import (
+    realsense_colour_from_depth,
+    realsense_lens,
+    realsense_unit_mm,
+    static_transform,
+)
 from modeler.types import Camera, InputError
-from sequences.intrinsics import Overrides
-from sequences.lens import Alignment, Lens
-from sequences.recording import AbstractStreams, paired
-from sequences.ros import messages
-from sequences.ros.bag import Bag, Stamp
-from sequences.ros.metadata import realsense_colour_from_depth, realsense_lens, realsense_unit_mm, static_transform
 
 
 def first_images(bag: Bag) -> dict[str, Any]:

@@ -16,9 +16,9 @@ from modeler.evaluation import true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.segmentation import Segmenter, scene_frames
+from modeler.sequences import open_sequence
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
-from sequences import open_sequence
-from sequences.rendering.renderer import RenderedSequence
 
 SHARED: Final = Path(__file__).resolve().parents[3] / "shared" / "data"
 RECORDINGS: Final = {"cap": "table", "kleenex": "table", "bear": "general", "dragon": "general"}

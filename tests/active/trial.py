@@ -18,11 +18,11 @@ from modeler.pipeline import Modeler
 from modeler.pipeline.modeler import Run
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.stage import Stage
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.pose_gain import edge_information
 from modeler.types import Array, Step
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.stage import Stage
 
 Policy = Literal["suggest", "random", "even"]
 EVEN_DEG = 25.0

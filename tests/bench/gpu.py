@@ -24,8 +24,8 @@ from modeler.kernels.gpu.memory import forget
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.se3 import rows
+from modeler.sequences import bundled, open_sequence
 from modeler.types import RayImage
-from sequences import bundled, open_sequence
 
 CORES = 2
 GOAL_SAMPLES_S, GOAL_PAIRS = 0.1, 50.0

@@ -13,8 +13,8 @@ import numpy as np
 import open3d as o3d
 from reference import PYRAMID_M, icp, icp_view, tsdf
 
+from modeler.sequences import open_sequence
 from modeler.types import Array, Frame
-from sequences import open_sequence
 
 _registration = o3d.pipelines.registration
 _REACH_M = 2.0 * PYRAMID_M[-1]

@@ -18,8 +18,8 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
+from modeler.sequences import AbstractSequence, bundled, open_sequence
 from modeler.types import AbstractPrior, Array, Frame, Plane, RayImage
-from sequences import AbstractSequence, bundled, open_sequence
 
 SEQUENCES = ("box", "flashlight", "tube")
 PRIORS: dict[str, AbstractPrior] = {"general": GeneralPrior(), "table": TablePrior()}

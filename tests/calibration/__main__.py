@@ -26,7 +26,7 @@ from calibration.tables import degrees, results_csv, results_json, rows, text
 from modeler.export import write_atomically
 from modeler.registration import ColouredIcpRegistrar
 from modeler.types import InputError
-from viz.figures import Curve, Panel, coverage_curves
+from modeler.viz.figures import Curve, Panel, coverage_curves
 
 _ORDERS_OF_MAGNITUDE = 100.0  # by which the control's mean squared error must exceed its covariance
 

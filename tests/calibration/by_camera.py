@@ -35,8 +35,8 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
+from modeler.sequences.rendering.renderer import RenderedSequence, surroundings
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage
-from sequences.rendering.renderer import RenderedSequence, surroundings
 
 Key = TypeVar("Key")
 NOMINAL: Final = 0.02

@@ -9,10 +9,10 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from sequences.rendering.charts import Faces
-from sequences.rendering.labels import Label, Print
-from sequences.rendering.photography import Lamp, Photography
-from sequences.rendering.recipe import Recipe, builtin_recipes, load_recipe
+from modeler.sequences.rendering.charts import Faces
+from modeler.sequences.rendering.labels import Label, Print
+from modeler.sequences.rendering.photography import Lamp, Photography
+from modeler.sequences.rendering.recipe import Recipe, builtin_recipes, load_recipe
 
 Half = Literal["tuning", "held-out"]
 Symmetry = Literal[

@@ -16,10 +16,10 @@ from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Tabletop, Turntable
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Posterior, RayImage
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Tabletop, Turntable
 
 OURS, CONTROL = "visibility", "icp"
 

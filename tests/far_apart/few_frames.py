@@ -29,8 +29,8 @@ from modeler.cli.advice import comes_back
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, translation_error_m, true_motion
 from modeler.export.report import RunMeta, frame_record, report_of
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Step
-from sequences.rendering.renderer import RenderedSequence
 
 SHAPES: Final = 16
 

@@ -13,9 +13,9 @@ from calibration.study import Condition, rendered_views, staged
 
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior
+from modeler.sequences import open_sequence
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import AbstractPoseDensity, Array, RayImage
-from sequences import open_sequence
-from sequences.rendering.renderer import RenderedSequence
 
 Limits = Literal["told", "none", "default"]
 """Prior of the motion: limits that contain it, wide limits, or the defaults."""

@@ -20,17 +20,16 @@ import test_inputs_kinect as kinect
 import test_inputs_realsense as realsense
 import test_inputs_ros as ros
 
-import sequences
 from fuzz.special import remove
-from modeler import se3
+from modeler import se3, sequences
 from modeler.cli import main
 from modeler.cli.convert import Convert
 from modeler.cli.inputs import solved
 from modeler.export import RunFolder, edges_of, poses_of
+from modeler.sequences import open_sequence, read_noise, survey, write_bop
+from modeler.sequences.image_folders import trajectory
+from modeler.sequences.rendering.recipe import load_recipe
 from modeler.types import Camera, Frame, InputError
-from sequences import open_sequence, read_noise, survey, write_bop
-from sequences.image_folders import trajectory
-from sequences.rendering.recipe import load_recipe
 
 
 @dataclass(frozen=True)

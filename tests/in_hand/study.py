@@ -21,13 +21,13 @@ from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export.report import RunMeta, frame_record, report_of
 from modeler.priors import HeldPrior
+from modeler.sequences import AbstractSequence
+from modeler.sequences.hand_shapes import HandMarkedSequence, HandShape
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.shapes import Box, Compound, placement
+from modeler.sequences.rendering.stage import matrix_of, place_of
+from modeler.sequences.rendering.trajectory import Hand, Place, Places
 from modeler.types import Array, HandPoses, Step
-from sequences import AbstractSequence
-from sequences.hand_shapes import HandMarkedSequence, HandShape
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import Box, Compound, placement
-from sequences.rendering.stage import matrix_of, place_of
-from sequences.rendering.trajectory import Hand, Place, Places
 
 Holder = Literal["robot", "steady", "person"]
 """A robot that regrasps the object halfway, one that does not, or a person."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from kills.commands import COMMANDS, CommandTrials, write_inputs
 from kills.trials import KINDS, Trials
-from sequences import bundled
+from modeler.sequences import bundled
 
 
 def main() -> int:

@@ -14,10 +14,10 @@ from typing import Final
 
 import recordings
 
-import sequences
 from kills.trials import environment
+from modeler import sequences
 from modeler.cli import main
-from sequences import write_bop
+from modeler.sequences import write_bop
 
 COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
     "convert": ("convert", "s", "--out", "made/out"),

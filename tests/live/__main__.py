@@ -28,9 +28,9 @@ from modeler.concurrency import in_background
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export import RunFolder, RunMeta
 from modeler.pipeline import NewestFrames
+from modeler.sequences.rendering.trajectory import Hand
 from modeler.types import Frame, Step
-from sequences.rendering.trajectory import Hand
-from viz.stream import open_stream
+from modeler.viz.stream import open_stream
 
 RATE_HZ: Final = 30.0
 FRAMES: Final = 186

@@ -24,10 +24,10 @@ from modeler.pipeline import Modeler
 from modeler.priors import TurntablePrior
 from modeler.rays import Sensor
 from modeler.segmentation import Scene
+from modeler.sequences import AbstractSequence
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Turntable
 from modeler.types import Array, Solution, Step
-from sequences import AbstractSequence
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Turntable
 
 _STEP_DEG, _SIGMA_DEG, _FRAMES = 24.0, 1.0, 15
 _FIRST = 4  # pairs that came before the axis was known

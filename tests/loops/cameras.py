@@ -27,10 +27,10 @@ from trust.study import MAX_DEG, MAX_M, MIN_F, built, f_score, pose_errors
 from loops.covariances import judged, pushed
 from modeler.cli.options import PriorOptions
 from modeler.export import write_atomically
+from modeler.sequences import AbstractSequence
+from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, Frame
-from sequences import AbstractSequence
-from sequences.rendering.meshes import Mesh
-from sequences.rendering.renderer import RenderedSequence
 
 _RADIUS: Final = float(stats.chi2(6).ppf(0.95))
 _ENDS: Final = ((False, 0), (False, 3), (True, 0), (True, 3))

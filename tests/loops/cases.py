@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from calibration.specimens import load_specimen
 
-import sequences
+from modeler import sequences
+from modeler.sequences import AbstractSequence
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.types import Array, Frame
-from sequences import AbstractSequence
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Place, Places
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 BUNDLED = Path(sequences.__file__).parent / "bundled"

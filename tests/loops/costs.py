@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from viz.report.plots import new_figure
+from modeler.viz.report.plots import new_figure
 
 _WINDOW = 20  # frames over which time is drawn as a mean: closures come and go
 

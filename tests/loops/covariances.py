@@ -27,9 +27,9 @@ from modeler.evaluation import nees, true_motion
 from modeler.export import write_atomically
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.segmentation import scene_frames
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Tabletop
 from modeler.types import Array, Solution, Step
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Tabletop
 
 _FAR = 5  # frames
 _KINDS = ("pose", "near", "far")

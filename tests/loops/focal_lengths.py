@@ -25,8 +25,8 @@ from modeler.closure import Closer
 from modeler.export import write_atomically
 from modeler.segmentation import scene_frames
 from modeler.self_calibration import FocalCalibrator
+from modeler.sequences import FocalFactor, RefocusedSequence
 from modeler.types import Step
-from sequences import FocalFactor, RefocusedSequence
 
 _ERRORS = (-0.08, -0.06, -0.05, -0.03, -0.02, 0.02, 0.03, 0.05, 0.06, 0.08)
 _SEED = 3  # of the choice of shapes

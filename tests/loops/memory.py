@@ -21,8 +21,8 @@ from loops.cases import turned
 from loops.known import Known
 from modeler.cli import build, compose, main
 from modeler.cli.console import Console
+from modeler.sequences import open_sequence, write_bop
 from modeler.types import Step
-from sequences import open_sequence, write_bop
 
 _FIELDS = ("RssAnon", "RssFile", "VmRSS", "VmHWM")
 

@@ -25,8 +25,8 @@ from statistics import median
 
 from modeler.cli.engines import engine
 from modeler.cli.jobs import NOTES, Job, fingerprint, write_note
-from sequences.rendering.recipe import load_recipe
-from sequences.rendering.renderer import render
+from modeler.sequences.rendering.recipe import load_recipe
+from modeler.sequences.rendering.renderer import render
 
 RECIPE = {
     "name": "small",

@@ -17,9 +17,9 @@ from pathlib import Path
 from kept import kept_lines
 from trust.plan import HALVES, Half
 
+from modeler.sequences.image_files import write_image
 from scenes import masks, occluded
 from scenes.plan import Plan
-from sequences.image_files import write_image
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,13 +15,13 @@ from trust.study import f_score, pose_errors
 
 from modeler.cli import compose
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.shapes import Box, Compound, Part, placement
+from modeler.sequences.rendering.stage import matrix_of, place_of
+from modeler.sequences.rendering.trajectory import Place, Places, Tabletop
 from modeler.types import BoolArray, Step
 from scenes.plan import arm, reach_m, thing
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import Box, Compound, Part, placement
-from sequences.rendering.stage import matrix_of, place_of
-from sequences.rendering.trajectory import Place, Places, Tabletop
 
 Holder = Literal["arm", "gripper"]
 HOLDERS: Final[tuple[Holder, ...]] = ("arm", "gripper")

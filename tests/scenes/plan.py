@@ -14,11 +14,11 @@ from trust.stage import Stage, posed
 
 from modeler import se3
 from modeler.cli.options import PriorOptions
+from modeler.sequences.rendering.recipe import Recipe, Table, Wall
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.shapes import AnyShape, Box, Capsule, Cylinder
+from modeler.sequences.rendering.trajectory import Place, Places, Tabletop
 from modeler.types import Array, BoolArray, Frame
-from sequences.rendering.recipe import Recipe, Table, Wall
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import AnyShape, Box, Capsule, Cylinder
-from sequences.rendering.trajectory import Place, Places, Tabletop
 
 Rng = np.random.Generator
 FRAMES: Final = 10

@@ -17,15 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-import sequences
-from modeler import se3
+from modeler import se3, sequences
 from modeler.cli import main as modeler
 from modeler.cli.inputs import reopened
 from modeler.evaluation import TrueSurface, align_to_model, surface_errors
 from modeler.export import write_atomically
 from modeler.fusion import Fuser
+from modeler.sequences import true_mesh
 from modeler.types import Array, RayImage
-from sequences import true_mesh
 from surfacing.cost import measured
 from surfacing.methods import METHODS, Surface
 

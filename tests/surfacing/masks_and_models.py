@@ -18,8 +18,8 @@ from PIL import Image
 
 from modeler.cli.inputs import reopened
 from modeler.export import read_model
+from modeler.sequences.image_files import write_image
 from modeler.types import Camera, Frame
-from sequences.image_files import write_image
 from surfacing.drawing import Scene
 
 _SIDE_PX: Final = 180

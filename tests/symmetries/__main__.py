@@ -25,9 +25,9 @@ from scipy import ndimage
 import modeler
 from modeler.export.standing import upright
 from modeler.fusion import Symmetries, SymmetryFinder
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import Turntable
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import Turntable
 
 NOISE_M: Final = 4e-4
 """Standard deviation of the places of a true mesh."""

@@ -11,10 +11,10 @@ from calibration.specimens import Symmetry
 from scipy import ndimage
 
 from modeler.cli.options import PriorOptions
+from modeler.sequences.rendering.recipe import Recipe, Wall
+from modeler.sequences.rendering.shapes import AnyShape, Box, Capsule, Compound, Part
+from modeler.sequences.rendering.trajectory import Place, Places, Tabletop, Turntable
 from modeler.types import BoolArray, Frame
-from sequences.rendering.recipe import Recipe, Wall
-from sequences.rendering.shapes import AnyShape, Box, Capsule, Compound, Part
-from sequences.rendering.trajectory import Place, Places, Tabletop, Turntable
 from trust.stage import Stage, posed
 
 Rng = np.random.Generator

@@ -11,9 +11,9 @@ from calibration.specimens import SPECIMENS, Symmetry, load_specimen
 
 from modeler.cli.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
-from sequences.rendering.depth_sensor import DepthSensor
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.trajectory import Places, Tabletop, Turntable
+from modeler.sequences.rendering.depth_sensor import DepthSensor
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.trajectory import Places, Tabletop, Turntable
 from trust.faults import FAULTS, Fault
 from trust.stage import WIDTH_PX, Stage, posed
 

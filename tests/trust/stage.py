@@ -11,12 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler.cli.options import PriorOptions
+from modeler.sequences import AbstractSequence
+from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.rendering.recipe import Recipe
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.trajectory import AnyTrajectory, Place, Places
 from modeler.types import Array, BoolArray, Frame
-from sequences import AbstractSequence
-from sequences.rendering.meshes import Mesh
-from sequences.rendering.recipe import Recipe
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.trajectory import AnyTrajectory, Place, Places
 
 WIDTH_PX = 320
 """Of the images: half of a Kinect's, so that a run takes seconds."""

@@ -15,9 +15,9 @@ from modeler.cli.advice import comes_back
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import TrueSurface, align_to_model, rotation_error_deg, surface_errors, true_motion
 from modeler.export.report import RunMeta, frame_record, report_of
+from modeler.sequences import AbstractSequence
+from modeler.sequences.rendering.meshes import Mesh
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel, Step
-from sequences import AbstractSequence
-from sequences.rendering.meshes import Mesh
 from trust.plan import Half, Plan
 from trust.stage import Recorded
 

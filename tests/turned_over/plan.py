@@ -17,11 +17,11 @@ from trust.stage import Stage, posed
 
 from modeler.cli.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
+from modeler.sequences.rendering.recipe import Recipe, TurnedOver
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.shapes import MeshFile
+from modeler.sequences.rendering.trajectory import Place, Places, Tabletop, Turntable
 from modeler.types import Array
-from sequences.rendering.recipe import Recipe, TurnedOver
-from sequences.rendering.renderer import RenderedSequence
-from sequences.rendering.shapes import MeshFile
-from sequences.rendering.trajectory import Place, Places, Tabletop, Turntable
 
 Gap = Literal["jump", "nothing", "hand"]
 GAPS: Final[tuple[Gap, ...]] = ("jump", "nothing", "hand")

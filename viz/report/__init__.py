@@ -1,3 +1,3 @@
 """A run as one page that opens anywhere: no network, no viewer to install."""
 
-from viz.report.page import write_page as write_page
+from modeler.viz.report.page import write_page as write_page

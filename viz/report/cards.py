@@ -17,11 +17,11 @@ from scipy import ndimage
 
 from modeler import evaluation, se3
 from modeler.types import ACCEPTED, Array, Edge, Outcome, explain
-from viz import entities
-from viz.blueprint import FROM_THE_SIDE
-from viz.reader import FRAME_PATHS
-from viz.readings import certainty_words
-from viz.report.run_data import Result, Row, cloud
+from modeler.viz import entities
+from modeler.viz.blueprint import FROM_THE_SIDE
+from modeler.viz.reader import FRAME_PATHS
+from modeler.viz.readings import certainty_words
+from modeler.viz.report.run_data import Result, Row, cloud
 
 _TERMS: Final = {
     "13 → 12": "frame 13 was registered to frame 12: the pose of the object in the one relative to the other",

@@ -16,7 +16,7 @@ from PIL import Image
 from modeler.export import read_model
 from modeler.export.mesh import sigma_rgb
 from modeler.types import Array, InputError
-from viz.model_view import coarsened
+from modeler.viz.model_view import coarsened
 
 _TRIANGLES: Final = 60_000
 _ABOVE_LEFT: Final = np.array([-0.5, -0.5, -0.75])

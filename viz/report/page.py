@@ -17,12 +17,12 @@ from modeler.export import write_atomically
 from modeler.export.mesh import MOST_SIGMA_M
 from modeler.export.standing import model_upright
 from modeler.types import ACCEPTED, Array, Outcome, loops_closed
-from viz.report import plots
-from viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
-from viz.report.evidence import evidence_table
-from viz.report.mesh import Mesh, portrait, read_mesh, scene
-from viz.report.run_data import Result, Row, recorded, surfaces
-from viz.report.symmetries import symmetry_section
+from modeler.viz.report import plots
+from modeler.viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
+from modeler.viz.report.evidence import evidence_table
+from modeler.viz.report.mesh import Mesh, portrait, read_mesh, scene
+from modeler.viz.report.run_data import Result, Row, recorded, surfaces
+from modeler.viz.report.symmetries import symmetry_section
 
 _SHAPE_POINTS: Final = 6_000
 _CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
@@ -262,7 +262,7 @@ def _scale() -> str:
 
 
 def _asset(name: str) -> str:
-    return (resources.files("viz.report") / name).read_text(encoding="utf-8")
+    return (resources.files("modeler.viz.report") / name).read_text(encoding="utf-8")
 
 
 def figure(picture: bytes, caption: str, *, style: str = "", kind: str = "svg+xml") -> str:

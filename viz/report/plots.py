@@ -11,9 +11,9 @@ import numpy as np
 from modeler import evaluation, se3
 from modeler.export.standing import ring_axes
 from modeler.types import Array, PoseGaussian
-from viz.figures import Curve, Panel, coverage_curves
-from viz.readings import Sd, sd_of
-from viz.report.run_data import Result
+from modeler.viz.figures import Curve, Panel, coverage_curves
+from modeler.viz.readings import Sd, sd_of
+from modeler.viz.report.run_data import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,8 +18,8 @@ from modeler.export import RunFolder, edges_of, poses_of
 from modeler.graph import PoseGraph, dead_reckoning
 from modeler.regular_files import check_regular
 from modeler.types import Array, Edge, InputError, PoseGaussian
-from viz import entities
-from viz.reader import READ, steps_of
+from modeler.viz import entities
+from modeler.viz.reader import READ, steps_of
 
 
 @dataclass(frozen=True, eq=False)
