@@ -91,7 +91,7 @@ _MODULES = {
         "Solution",
         "Step",
     ),
-    "sequences": ("open_sequence",),
+    "modeler.sequences": ("open_sequence",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

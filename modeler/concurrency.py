@@ -36,9 +36,14 @@ class Pace:
             self.resting_until_s = time.monotonic() + (1.0 / self.share - 1.0) * seconds
 
 
+def cores() -> int:
+    """Return how many cores this process may use; all of the machine where the system does not tell (macOS)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def is_parallel() -> bool:
     """Return whether more than one thread may compute: as NUMBA_NUM_THREADS says, or else the number of cores."""
-    return int(os.environ.get("NUMBA_NUM_THREADS") or len(os.sched_getaffinity(0))) > 1
+    return int(os.environ.get("NUMBA_NUM_THREADS") or cores()) > 1
 
 
 def in_parallel(first: Callable[[], S], second: Callable[[], T]) -> tuple[S, T]:

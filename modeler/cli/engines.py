@@ -15,6 +15,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar, final
 
+from modeler.concurrency import cores
 from modeler.types import InputError
 
 T = TypeVar("T")
@@ -25,14 +26,9 @@ _QUEUED = 100  # jobs in a Slurm queue at a time, unless --workers is given
 _PATIENCE_S = 30  # for a scheduler to answer
 
 
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def free_bytes() -> int:
     """Return how much memory is left, for this machine and for the control group of this process."""
-    pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with contextlib.suppress(OSError, ValueError):  # on Linux, including caches that can be freed
         lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         pages = int(lines["MemAvailable"].split()[0]) * 1024

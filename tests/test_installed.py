@@ -1,0 +1,78 @@
+"""The package as users install it: outside the repository, and on systems other than Linux."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+from commanded import FILES
+from sources import ROOT
+
+LINUX_ONLY = ("sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "copy_file_range", "pipe2")
+"""Functions of `os` that macOS lacks."""
+
+
+def test_every_module_is_imported_and_cores_are_counted_without_what_only_linux_has() -> None:
+    code = f"""
+import importlib, os, pkgutil
+for name in {LINUX_ONLY}:
+    if hasattr(os, name):
+        delattr(os, name)
+import modeler
+from modeler.concurrency import cores, is_parallel
+os.environ.pop("NUMBA_NUM_THREADS", None)
+assert cores() == os.cpu_count()
+assert is_parallel() == (cores() > 1)
+for module in pkgutil.walk_packages(modeler.__path__, "modeler."):
+    try:
+        importlib.import_module(module.name)
+    except ModuleNotFoundError as error:  # of an extra that is not installed
+        if str(error.name).startswith("modeler"):
+            raise
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_an_installed_package_builds_a_bundled_sequence_from_another_folder(tmp_path: Path) -> None:
+    """`pip install .` of a copy into a new environment; the dependencies are those of the running one."""
+    source, home, elsewhere = tmp_path / "source", tmp_path / "environment", tmp_path / "elsewhere"
+    for name in ("modeler", "sequences", "viz"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    elsewhere.mkdir()
+    venv.create(home)
+    python = home / "bin" / "python"
+    packages = Path(sysconfig.get_path("purelib", vars={"base": str(home), "platbase": str(home)}))
+    (packages / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+
+    def run(*command: object) -> subprocess.CompletedProcess[str]:
+        words = [str(word) for word in command]
+        return subprocess.run(words, cwd=elsewhere, env=environment, capture_output=True, text=True, check=False)
+
+    installed = run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--quiet", source)
+    if "No matching distribution found for setuptools" in installed.stderr:
+        pytest.skip("no package index with the build system can be reached")
+    assert installed.returncode == 0, installed.stderr
+    assert {path.name for path in packages.iterdir()} - {"__pycache__", "dependencies.pth"} == {
+        "modeler",
+        f"modeler-{run(home / 'bin' / 'modeler', '--version').stdout.split()[-1]}.dist-info",
+    }
+    box = Path(run(python, "-c", "from modeler.sequences import bundled; print(bundled('box'))").stdout.strip())
+    assert box.is_relative_to(packages)
+    built = run(home / "bin" / "modeler", "build", box, "--out", "runs/box", "--prior", "table", "--frames", "0:4")
+    assert built.returncode in (0, 3), built.stderr
+    assert {path.name for path in (elsewhere / "runs" / "box").iterdir()} >= FILES
+    used = run(python, "-c", "import modeler; print(modeler.open_sequence.__module__, modeler.__file__)").stdout.split()
+    assert used[0] == "modeler.sequences.opening"
+    assert Path(used[1]).is_relative_to(packages)
