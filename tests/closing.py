@@ -65,18 +65,18 @@ class Run:
             steps = self.numbers.index(source) - self.numbers.index(max(self.views)) if self.views else 1
             if self.views:
                 posteriors = [spoil(self.measured(next(reversed(self.views)), source, rng, bias_here))]
-                while closer.placement(posteriors, map_view, steps=steps)[0] is None:
+                while closer.placement(posteriors, map_view, steps=steps).base is None:
                     target = closer.relocalisation_target(posteriors, map_view)
                     if target is None:
                         break
                     posteriors.append(spoil(self.measured(target, source, rng, bias_here)))
-                base, _ = closer.placement(posteriors, map_view, steps=steps)
+                base = closer.placement(posteriors, map_view, steps=steps).base
                 if base is not None:
                     targets = closer.closure_targets(base, map_view, last=source == self.numbers[-1])
                     tried = [posterior.target for posterior in posteriors]
                     targets = [target for target in targets if target not in tried]
                     posteriors += [spoil(self.measured(target, source, rng, bias_here)) for target in targets]
-            edges = closer.judge(posteriors, map_view, steps=steps)
+            edges = judged(closer, posteriors, map_view, steps=steps)
             self.tried[source], self.judged[source] = tuple(p.target for p in posteriors), edges
             self.graph = self.graph.plus(edges)
             if not self.views or any(edge.accepted for edge in edges):
@@ -98,6 +98,10 @@ class Run:
 
     def closures(self) -> list[Edge]:
         return [edge for edges in self.judged.values() for edge in edges if edge.kind == "closure"]
+
+
+def judged(closer: Closer, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> tuple[Edge, ...]:
+    return closer.judge(posteriors, closer.placement(posteriors, map_view, steps=steps), map_view, steps=steps)
 
 
 def witnessed(posterior: Posterior, nats: float) -> Posterior:

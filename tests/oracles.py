@@ -55,7 +55,13 @@ class Oracle(AbstractRegistrar):
     off_rad: float = 0.0
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         truth = POSES[target.index] @ se3.inverse(POSES[source.index])
         error = se3.exp(rng.normal(size=6) * SIGMAS) @ se3.exp(np.array([self.off_rad, 0, 0, 0, 0, 0]))

@@ -10,9 +10,8 @@ from prior_cases import views
 from modeler import se3
 from modeler.closure import Closer
 from modeler.graph import Smoother
-from modeler.pipeline import Modeler
+from modeler.pipeline.attempts import Search, predicted
 from modeler.pipeline.state import State
-from modeler.pipeline.tracking import Tracker
 from modeler.priors import AnyMotion, AutoPrior, GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.types import PoseGaussian, Solution
@@ -60,7 +59,6 @@ def test_pairs_are_registered_within_limits_that_hold_their_predicted_motion(
     prior = GeneralPrior(max_offset_m=0.2, limits_assumed=assumed)
     solution = Solution({target.index: np.eye(4), source.index: poses[0] @ se3.inverse(poses[int(turn_deg)])})
     state = State(smoother=Smoother(solution=solution), views={target.index: target, source.index: source})
-    tracker = Tracker(state, prior, Closer(), Sensor(), Modeler().register)
     motion = PoseGaussian(solution.relative(target.index, source.index), np.eye(6))
-    found = tracker._predicted(source, target.index, motion, prior)
+    found = predicted(Search(state, prior, Closer(), source, target.index), target.index, prior, motion)
     assert isinstance(found.known, GeneralPrior if kept else AnyMotion)

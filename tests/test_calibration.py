@@ -105,7 +105,13 @@ class Looking(AbstractRegistrar):
     seen: list[RayImage]
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         self.seen.append(source)
         return _posterior(PoseGaussian(np.eye(4), np.eye(6)))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from closing import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, posterior_of, told, turned, view, witnessed
+from closing import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, judged, posterior_of, told, turned, view, witnessed
 
 from modeler import se3
 from modeler.closure import Closer, MapView
@@ -29,8 +29,9 @@ from modeler.types import (
 
 
 def test_first_frame_has_nothing_to_be_registered_against() -> None:
-    assert Closer().placement([], MapView({}, Solution())) == (None, NotPlaced())
-    assert Closer().judge([], MapView({}, Solution())) == ()
+    nothing = Closer().placement([], MapView({}, Solution()))
+    assert (nothing.base, nothing.reason) == (None, NotPlaced())
+    assert judged(Closer(), [], MapView({}, Solution())) == ()
 
 
 @pytest.mark.parametrize(
@@ -158,7 +159,7 @@ def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
     closer = Closer()
     start = Solution({0: np.eye(4)})
     for outcome in Outcome:
-        (edge,) = closer.judge([posterior_of(1, 0, np.eye(4), outcome)], MapView({0: view(0)}, start))
+        (edge,) = judged(closer, [posterior_of(1, 0, np.eye(4), outcome)], MapView({0: view(0)}, start))
         assert edge.kind == "odometry"
         assert edge.accepted == (outcome in (Outcome.CONVERGED, Outcome.AMBIGUOUS))
         assert edge.accepted or edge.reason == Failed(outcome)
@@ -169,7 +170,7 @@ def test_odometry_is_accepted_where_usable_and_refused_with_advice() -> None:
 )
 def test_invalid_covariance_is_rejected(covariance: Array) -> None:
     posterior = replace(posterior_of(1, 0, np.eye(4)), pose=PoseGaussian(np.eye(4), covariance))
-    (edge,) = Closer().judge([posterior], MapView({0: view(0)}, Solution({0: np.eye(4)})))
+    (edge,) = judged(Closer(), [posterior], MapView({0: view(0)}, Solution({0: np.eye(4)})))
     assert not edge.accepted
     assert isinstance(edge.reason, Degenerate)
 
@@ -397,10 +398,10 @@ def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contra
     truth, solution = run.measured(4, 8, np.random.default_rng(0), np.zeros(6)), run.solution  # as far as four steps
     doubtful = witnessed(replace(truth, source=12, target=8), -90.0)
     map_view = MapView(run.views, solution, run.graph.edges)
-    assert Closer().placement([doubtful], map_view, steps=1)[0] is doubtful
-    assert Closer().placement([doubtful], map_view, steps=4)[0] is None
-    assert isinstance(Closer().judge([doubtful], map_view, steps=4)[0].reason, LowEvidence)
-    assert Closer().placement([witnessed(doubtful, -30.0)], map_view, steps=4)[0] is not None
+    assert Closer().placement([doubtful], map_view, steps=1).base is doubtful
+    assert Closer().placement([doubtful], map_view, steps=4).base is None
+    assert isinstance(judged(Closer(), [doubtful], map_view, steps=4)[0].reason, LowEvidence)
+    assert Closer().placement([witnessed(doubtful, -30.0)], map_view, steps=4).base is not None
 
 
 @pytest.mark.parametrize("lost", [1, 16])

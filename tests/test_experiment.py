@@ -63,7 +63,13 @@ class ContradictedWithin(AbstractRegistrar):
     """Knows the truth where any motion is possible; within limits, the images contradict its answer."""
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         turned = se3.moved(np.eye(4)[None], np.array([[3.0, 0.0, 0.0, 0.0, 0.0, 0.0]]), source.centroid_m)
         wide = np.isfinite(density.log_density(turned)).all()
@@ -206,7 +212,13 @@ def test_sparse_experiments_give_methods_few_points() -> None:
             self.seen: list[int] = []
 
         def register(
-            self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+            self,
+            source: RayImage,
+            target: RayImage,
+            density: AbstractPoseDensity,
+            *,
+            rng: np.random.Generator,
+            effort: float = 1.0,
         ) -> Posterior:
             self.seen.extend([len(source.points_m), len(target.points_m)])
             return Oracle().register(source, target, density, rng=rng)
@@ -247,7 +259,13 @@ def test_a_closed_turn_is_judged_by_what_all_its_steps_leave(known: bool) -> Non
         """Turns by a little too much about one axis at every step."""
 
         def register(
-            self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+            self,
+            source: RayImage,
+            target: RayImage,
+            density: AbstractPoseDensity,
+            *,
+            rng: np.random.Generator,
+            effort: float = 1.0,
         ) -> Posterior:
             truth = POSES[target.index] @ se3.inverse(POSES[source.index])
             posterior = Oracle().register(source, target, density, rng=rng)

@@ -18,7 +18,7 @@ from kills.commands import COMMANDS, CommandTrials, write_inputs
 from kills.trials import KINDS, SAME, Trials
 
 from modeler.cli import build, main
-from modeler.export import Pairs, Remembered, RunFolder, RunMeta, alone
+from modeler.export import PairCache, Pairs, RunFolder, RunMeta, alone
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar
@@ -48,9 +48,10 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
         density: AbstractPoseDensity,
         *,
         rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         pairs.append((source.index, target.index))
-        return register(self, source, target, density, rng=rng)
+        return register(self, source, target, density, rng=rng, effort=effort)
 
     monkeypatch.setattr(IcpRegistrar, "register", noted)
     return pairs
@@ -247,8 +248,8 @@ def test_what_is_kept_comes_back_to_the_bit(tmp_path: Path, rng: np.random.Gener
     pairs, kept = Pairs(tmp_path / "pairs"), posterior(rng)
     if bare:
         kept = replace(kept, modes=(), samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
-    pairs.keep(kept, "question")
-    back = pairs.get(7, 3, "question")
+    pairs.keep(kept, "key")
+    back = pairs.get(7, 3, "key")
     assert back is not None
     assert len(back.modes) == len(kept.modes)
     for field in fields(Posterior):
@@ -261,42 +262,43 @@ def test_what_is_kept_comes_back_to_the_bit(tmp_path: Path, rng: np.random.Gener
     ]
     for ours, theirs in gaussians:
         assert (ours.mean.tobytes(), ours.covariance.tobytes()) == (theirs.mean.tobytes(), theirs.covariance.tobytes())
-    for other in ((7, 2, "question"), (6, 3, "question"), (7, 3, "another")):
+    for other in ((7, 2, "key"), (6, 3, "key"), (7, 3, "another")):
         assert pairs.get(*other) is None
     pairs.drop()
     pairs.drop()
-    assert pairs.get(7, 3, "question") is None
+    assert pairs.get(7, 3, "key") is None
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_kept_and_broken_counts_as_lost(tmp_path: Path, rng: np.random.Generator) -> None:
     pairs = Pairs(tmp_path / "pairs")
-    pairs.keep(posterior(rng), "question")
+    pairs.keep(posterior(rng), "key")
     (file,) = pairs.folder.iterdir()
     content = file.read_bytes()
     for cut in (0, 10, len(content) // 2, len(content) - 3):
         file.write_bytes(content[:cut])
-        assert pairs.get(7, 3, "question") is None
+        assert pairs.get(7, 3, "key") is None
     np.savez(file, mean=np.array([{}], dtype=object), allow_pickle=True)  # nothing is unpickled
-    assert pairs.get(7, 3, "question") is None
-    Pairs(tmp_path / "file" / "pairs").keep(posterior(rng), "question")  # nowhere to keep it: no fault
+    assert pairs.get(7, 3, "key") is None
+    Pairs(tmp_path / "file" / "pairs").keep(posterior(rng), "key")  # nowhere to keep it: no fault
 
 
-def test_an_answer_is_to_one_question_only(tmp_path: Path, asked: list[tuple[int, int]]) -> None:
+def test_a_cached_registration_is_that_of_the_same_inputs_only(tmp_path: Path, asked: list[tuple[int, int]]) -> None:
     frames = [open_sequence(BOX).frame(index) for index in (0, 1)]
     views = [Sensor().ray_image(frame, None) for frame in frames]
     nearer = Sensor().ray_image(replace(frames[0], depth_m=frames[0].depth_m - np.float32(0.001)), None)
     priors = [GeneralPrior(), GeneralPrior().relaxed(2)]
-    remembered = Remembered(IcpRegistrar(), Pairs(tmp_path), {})
+    cache = PairCache(Pairs(tmp_path), {})
 
-    def ask(target: RayImage, prior: int = 0, seed: int = 0) -> int:
+    def ask(target: RayImage, prior: int = 0, seed: int = 0, effort: float = 1.0) -> int:
         density = priors[prior].between(views[1], target)
-        remembered.register(views[1], target, density, rng=np.random.default_rng(seed))
+        cache.register(IcpRegistrar(), views[1], target, density, rng=np.random.default_rng(seed), effort=effort)
         return len(asked)
 
     assert [ask(views[0]), ask(views[0])] == [1, 1]
     assert [ask(views[0], prior=1), ask(views[0], prior=1)] == [2, 2]
     assert [ask(views[0], seed=1), ask(nearer), ask(views[0])] == [3, 4, 4]
+    assert [ask(views[0], effort=0.25), ask(views[0])] == [5, 5]
 
 
 @pytest.mark.slow

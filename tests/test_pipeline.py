@@ -101,10 +101,25 @@ class Oracle(AbstractRegistrar):
     reach: float = 1.0
     asked: list[tuple[int, int]] = field(default_factory=list)
     priors: list[tuple[int, int, float]] = field(default_factory=list)
+    quick: Oracle | None = None
+    """Asked for little effort."""
+
+    @property
+    def least_effort(self) -> float:
+        return 1.0 if self.quick is None else 0.25
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
+        if effort < 1.0:
+            assert self.quick is not None
+            return self.quick.register(source, target, density, rng=rng)
         if isinstance(density, DefensiveMixture):  # the graph foretells it
             (guess,) = density.proposals
             assert isinstance(guess, KernelMixture)

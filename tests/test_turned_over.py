@@ -14,12 +14,13 @@ from trust.plan import coarser
 from modeler import se3
 from modeler.closure import Closer, MapView
 from modeler.evaluation import rotation_error_deg, true_motion
-from modeler.export import Pairs, Remembered
+from modeler.export import PairCache, Pairs
 from modeler.graph import PoseGraph, solve
 from modeler.graph.axis import steps_of
 from modeler.graph.pose_graph import Factor
 from modeler.pipeline import Modeler
 from modeler.pipeline.joining import Alignment, Joiner, Segment
+from modeler.pipeline.state import State
 from modeler.priors import TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
@@ -177,7 +178,7 @@ def test_postures_of_the_study_rest_on_the_table() -> None:
     assert np.degrees(np.arccos(np.clip(before[2] @ after[2], -1.0, 1.0))) > 59.0
 
 
-def test_alignments_are_judged_by_the_likelihood_of_the_run_also_where_its_pairs_are_remembered(tmp_path: Path) -> None:
+def test_alignments_are_judged_by_the_likelihood_of_the_run(tmp_path: Path) -> None:
     depth_alone = VisibilityRegistrar(VisibilityLikelihood(colour=False))
-    joiner = Joiner(Remembered(depth_alone, Pairs(tmp_path), {}))
-    assert joiner._visibility is depth_alone
+    cached = Modeler(registrar=depth_alone, cache=PairCache(Pairs(tmp_path), {}))
+    assert cached.joiner(cached.tracker(State()))._visibility is depth_alone

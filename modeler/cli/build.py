@@ -80,7 +80,7 @@ class Build:
         from modeler.cli.inputs import estimated_camera
         from modeler.cli.outputs import check_run_folder
         from modeler.concurrency import in_parallel
-        from modeler.export import Remembered, RunFolder, RunMeta, alone
+        from modeler.export import PairCache, RunFolder, RunMeta, alone
         from modeler.viz.stream import ends_whole, load
 
         began_s = time.perf_counter()
@@ -109,9 +109,7 @@ class Build:
         with alone(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
             folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)
-            quick = None if modeler.quick is None else Remembered(modeler.quick, folder.pairs, meta.versions)
-            registrar = Remembered(modeler.registrar, folder.pairs, meta.versions)
-            modeler = replace(modeler, registrar=registrar, quick=quick)
+            modeler = replace(modeler, cache=PairCache(folder.pairs, meta.versions))
             if before:
                 say(f"the run was begun with {', '.join(before)}: its pairs are registered again")
             if remark:

@@ -17,7 +17,7 @@ from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptio
 from modeler.closure import Closer
 from modeler.fusion import Fuser
 from modeler.kernels import gpu
-from modeler.pipeline import Modeler, quick_registrar
+from modeler.pipeline import Modeler
 from modeler.priors import (
     AutoPrior,
     AxesPrior,
@@ -79,7 +79,6 @@ def modeler(
         sensor=sensor,
         prior=chosen_prior(prior_options, sequence),
         registrar=chosen,
-        quick=quick_registrar(chosen),
         closer=Closer(),
         fuser=Fuser(),
         seed=method.seed,

@@ -52,6 +52,8 @@ class Join:
         from modeler.export import RunFolder, RunMeta, alone
         from modeler.graph import PoseGraph, solve
         from modeler.pipeline.joining import Joiner, Segment
+        from modeler.pipeline.pairs import Registrations
+        from modeler.registration import VisibilityRegistrar
         from modeler.types import InputError
 
         _check(self)
@@ -59,7 +61,7 @@ class Join:
         first, second = reopened(self.run_a), reopened(self.run_b)
         offset = max(record["id"] for record in first.report["frames"]) + 1
         second = _shifted(second, offset)
-        joiner = Joiner(pairs=self.pairs, seed=self.seed)
+        joiner = Joiner(Registrations(VisibilityRegistrar(), self.seed), pairs=self.pairs)
         parts = [Segment(run.views, run.solution, run.edges) for run in (first, second)]
         alignments = joiner.join(*parts)
         if not alignments:

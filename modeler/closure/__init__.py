@@ -5,3 +5,4 @@ from modeler.closure.consistency import ConsistencyModel as ConsistencyModel
 from modeler.closure.consistency import Thresholds as Thresholds
 from modeler.closure.map_view import MapView as MapView
 from modeler.closure.map_view import PathNetwork as PathNetwork
+from modeler.closure.relocaliser import Placement as Placement

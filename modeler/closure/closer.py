@@ -11,7 +11,7 @@ from modeler import se3
 from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, failure, modes
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView, ShortestPaths, composed
-from modeler.closure.relocaliser import Relocaliser
+from modeler.closure.relocaliser import Placement, Relocaliser
 from modeler.types import (
     AWAY_DEG,
     NEAR_DEG,
@@ -20,7 +20,6 @@ from modeler.types import (
     NotPlaced,
     PoseGaussian,
     Posterior,
-    Reason,
     Solution,
     loops_closed,
     segments,
@@ -155,9 +154,7 @@ class Closer:
             return None
         return self._relocaliser(map_view, self._evidence(map_view)).next_target(posteriors)
 
-    def placement(
-        self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1
-    ) -> tuple[Posterior | None, Reason]:
+    def placement(self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> Placement:
         """Return the posterior that places a frame, and why: that of the previous view, or else of another.
 
         Args:
@@ -171,7 +168,9 @@ class Closer:
         """Return the prediction of target_from_source between a frame, placed by a registration, and a view."""
         return composed(modes(base)[0][1], solution.relative_gaussian(target, base.target))
 
-    def judge(self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> tuple[Edge, ...]:
+    def judge(
+        self, posteriors: Sequence[Posterior], placement: Placement, map_view: MapView, *, steps: int = 1
+    ) -> tuple[Edge, ...]:
         """Return an edge, accepted or rejected, per posterior. The frame joins the graph if any is accepted.
 
         Edges to views from which the object had turned away are closures; of the others, the one that places the frame,
@@ -179,19 +178,21 @@ class Closer:
 
         Args:
             posteriors: registrations of one new frame, against the previous view first.
+            placement: of the frame.
             map_view: the map so far.
             steps: number of frames from the previous view to this one.
         """
-        base, base_reason = self.placement(posteriors, map_view, steps=steps)
+        base = placement.base
         paths = map_view.shortest_paths(base.target) if base is not None and len(posteriors) > 1 else ShortestPaths()
         evidence, edges = self._evidence(map_view), []
         for number, posterior in enumerate(posteriors):
             consecutive = number == 0 and steps == 1
             closes = number > 0 and self._came_back(posterior, map_view, paths)
-            places = number == 0 or base is None or posterior is base
+            is_base = base is not None and posterior.target == base.target
+            places = number == 0 or base is None or is_base
             kind: EdgeKind = "closure" if closes else "odometry" if places else "span"
-            if posterior is base:
-                edges.append(Edge(posterior, kind, True, base_reason))
+            if is_base:
+                edges.append(Edge(posterior, kind, True, placement.reason))
             elif reason := failure(posterior) if consecutive else self.thresholds.defect(posterior, evidence):
                 edges.append(Edge(posterior, kind, False, reason))
             elif base is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,6 +11,16 @@ from modeler import se3
 from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, failure, modes
 from modeler.closure.map_view import MapView
 from modeler.types import ConfirmedBy, JoinsPrevious, NearExtrapolation, NotPlaced, Posterior, Reason, Relocalised
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Which registration places a frame, if one does, and why."""
+
+    base: Posterior | None = None
+    """The registration; None: none does."""
+    reason: Reason = field(default_factory=NotPlaced)
+    """Why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +45,17 @@ class Relocaliser:
     steps: int = 1
     """Number of frames from the previous view to this one."""
 
-    def placement(self, posteriors: Sequence[Posterior]) -> tuple[Posterior | None, Reason]:
+    def placement(self, posteriors: Sequence[Posterior]) -> Placement:
         """Return the posterior that places a frame, and why.
 
         Args:
             posteriors: registrations of the frame, the previous view first.
         """
         if not posteriors:
-            return None, NotPlaced()
+            return Placement()
         odometry = posteriors[0]
         if self._continues(odometry) and (self.steps == 1 or self._angle_off_deg(odometry) <= self.max_angle_deg):
-            return odometry, JoinsPrevious(odometry.outcome, odometry.overlap)
+            return Placement(odometry, JoinsPrevious(odometry.outcome, odometry.overlap))
         candidates = [posterior for posterior in posteriors if self.thresholds.places_alone(posterior, self.evidence)]
         for posterior in sorted(candidates, key=lambda posterior: -posterior.overlap):
             off_deg = self._angle_off_deg(posterior)
@@ -57,9 +67,9 @@ class Relocaliser:
             if support is None:
                 continue
             if posterior is odometry:
-                return posterior, JoinsPrevious(posterior.outcome, posterior.overlap, support)
-            return posterior, Relocalised(posterior.overlap, support)
-        return None, NotPlaced()
+                return Placement(posterior, JoinsPrevious(posterior.outcome, posterior.overlap, support))
+            return Placement(posterior, Relocalised(posterior.overlap, support))
+        return Placement()
 
     def next_target(self, posteriors: Sequence[Posterior]) -> int | None:
         """Return the earlier view to register a lost frame against next; None if none is left.

@@ -11,7 +11,7 @@ import numpy as np
 
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.experiment.trials import Trial
-from modeler.pipeline import prepare, register, retry_unlimited
+from modeler.pipeline import Registrations, prepare, without_limits
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.types import (
@@ -209,10 +209,10 @@ class Experiment:
             return str(error)
 
         def attempt(known: AbstractPoseDensity) -> Posterior:
-            return register(method, source, target, known, seed=self.seed)
+            return Registrations(method, self.seed).register(source, target, known)
 
         within = attempt(density)
-        return retry_unlimited(within, prior, lambda unlimited: attempt(unlimited.between(source, target)))
+        return without_limits(within, prior, lambda unlimited: attempt(unlimited.between(source, target)))
 
 
 def _blank(sequence: str, method: str, pair: Pair, truth: Array | None) -> Trial:

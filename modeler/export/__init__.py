@@ -13,8 +13,8 @@ from modeler.export.mesh import mesh_of as mesh_of
 from modeler.export.mesh import simplified as simplified
 from modeler.export.mesh import tinted as tinted
 from modeler.export.mesh import write_mesh as write_mesh
+from modeler.export.pairs import PairCache as PairCache
 from modeler.export.pairs import Pairs as Pairs
-from modeler.export.pairs import Remembered as Remembered
 from modeler.export.placing import Placement as Placement
 from modeler.export.placing import default_up as default_up
 from modeler.export.placing import placement as placement

@@ -7,7 +7,7 @@ import hashlib
 import io
 import shutil
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, final
@@ -18,6 +18,7 @@ import numpy as np
 from modeler.export.files import settle_soon, write_atomically
 from modeler.regular_files import read_regular
 from modeler.types import (
+    AbstractPairCache,
     AbstractPoseDensity,
     AbstractRegistrar,
     InputError,
@@ -30,7 +31,7 @@ from modeler.types import (
 
 _DRAWN = 64  # poses at which priors are compared
 _GAUSSIAN = ("mean", "covariance", "by_focal")  # its arrays
-_digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several questions
+_digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several keys
 
 
 @final
@@ -44,28 +45,28 @@ class Pairs:
     folder: Path
     """It is made when there is something to keep."""
 
-    def get(self, source: int, target: int, question: str) -> Posterior | None:
+    def get(self, source: int, target: int, key: str) -> Posterior | None:
         """Return the stored result, to the bit; None if there is none.
 
         Args:
             source: frame number.
             target: frame number.
-            question: a digest of all inputs of the result.
+            key: a digest of all inputs of the result.
         """
         try:
-            packed = io.BytesIO(read_regular(self._path(source, target, question)))
+            packed = io.BytesIO(read_regular(self._path(source, target, key)))
             with np.load(packed, allow_pickle=False) as kept:
                 return _posterior({name: kept[name] for name in kept.files})
         except (InputError, OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
 
-    def keep(self, posterior: Posterior, question: str) -> None:
+    def keep(self, posterior: Posterior, key: str) -> None:
         """Store the result. If this fails, as on a full disk, it will be computed again."""
         packed = io.BytesIO()
         np.savez(packed, allow_pickle=False, **_arrays(posterior))
         with contextlib.suppress(OSError, InputError):
             self.folder.mkdir(exist_ok=True)
-            path = self._path(posterior.source, posterior.target, question)
+            path = self._path(posterior.source, posterior.target, key)
             write_atomically(path, packed.getvalue(), tidy=False)  # thousands; they go together
             settle_soon(path, self.folder)  # waiting for the disk would take as long as registering
 
@@ -109,57 +110,55 @@ class Pairs:
     def _dropped(self) -> Path:
         return self.folder.with_name(f"{self.folder.name}.dropped")
 
-    def _path(self, source: int, target: int, question: str) -> Path:
-        return self.folder / f"{source:06d}-{target:06d}-{question}.npz"
+    def _path(self, source: int, target: int, key: str) -> Path:
+        return self.folder / f"{source:06d}-{target:06d}-{key}.npz"
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Remembered(AbstractRegistrar):
-    """Returns stored registrations, delegates the rest to another registrar, and stores its results at once."""
+class PairCache(AbstractPairCache):
+    """Returns stored registrations and stores others at once."""
 
-    registrar: AbstractRegistrar
-    """Asked where memory ends."""
     pairs: Pairs
-    """The memory."""
+    """Where they are stored."""
     versions: Mapping[str, str]
-    """Of the packages: with others, answers may be others."""
-
-    @property
-    def method(self) -> AbstractRegistrar:
-        """The registrar that is asked."""
-        return self.registrar.method
+    """Of the packages, with others of which results may be others."""
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        registrar: AbstractRegistrar,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float,
     ) -> Posterior:
-        """Return the posterior of target_from_source."""
-        question = self._question((source, target), density, rng)
-        known = self.pairs.get(source.index, target.index, question)
-        if known is not None:
-            return known
-        found = self.registrar.register(source, target, density, rng=rng)
-        self.pairs.keep(found, question)
+        """Return the stored result of the same registration, or else register and store it."""
+        inputs = (registrar, sorted(self.versions.items()), rng.bit_generator.state, density.evidence, effort)
+        key = _key(inputs, (source, target), density)
+        stored = self.pairs.get(source.index, target.index, key)
+        if stored is not None:
+            return stored
+        found = registrar.register(source, target, density, rng=rng, effort=effort)
+        self.pairs.keep(found, key)
         return found
 
-    def _question(
-        self, views: tuple[RayImage, RayImage], density: AbstractPoseDensity, rng: np.random.Generator
-    ) -> str:
-        """Return a digest of all that an answer depends on.
 
-        A pair may be asked about more than once: with a prior that was grown, or has learnt from frames in between.
-        """
-        digest = hashlib.blake2b(digest_size=12)
-        asked = (self.registrar, sorted(self.versions.items()), rng.bit_generator.state, density.evidence)
-        digest.update(" ".join(map(str, asked)).encode())
-        for view in views:
-            if view not in _digests:
-                _digests[view] = _digest(view)
-            digest.update(_digests[view])
-        drawn = density.sample(_DRAWN, np.random.default_rng(0))
-        for numbers in (drawn, density.log_density(drawn), density.log_evidence(drawn)):
-            digest.update(np.ascontiguousarray(numbers).tobytes())
-        return digest.hexdigest()
+def _key(inputs: Sequence[object], views: Sequence[RayImage], density: AbstractPoseDensity) -> str:
+    """Return a digest of all inputs of a registration.
+
+    A pair may be registered more than once: with wider limits, or with what was learned from frames in between.
+    """
+    digest = hashlib.blake2b(" ".join(map(str, inputs)).encode(), digest_size=12)
+    for view in views:
+        if view not in _digests:
+            _digests[view] = _digest(view)
+        digest.update(_digests[view])
+    drawn = density.sample(_DRAWN, np.random.default_rng(0))
+    for numbers in (drawn, density.log_density(drawn), density.log_evidence(drawn)):
+        digest.update(np.ascontiguousarray(numbers).tobytes())
+    return digest.hexdigest()
 
 
 def _digest(view: RayImage) -> bytes:

@@ -4,7 +4,6 @@ from modeler.pipeline.modeler import Modeler as Modeler
 from modeler.pipeline.modeler import Run as Run
 from modeler.pipeline.newest import NewestFrames as NewestFrames
 from modeler.pipeline.pairs import Prepared as Prepared
+from modeler.pipeline.pairs import Registrations as Registrations
 from modeler.pipeline.pairs import prepare as prepare
-from modeler.pipeline.pairs import register as register
-from modeler.pipeline.pairs import retry_unlimited as retry_unlimited
-from modeler.pipeline.tracking import quick_registrar as quick_registrar
+from modeler.pipeline.pairs import without_limits as without_limits

@@ -18,15 +18,13 @@ from scipy.special import chdtri
 from modeler import se3
 from modeler.closure.consistency import widest_rotation
 from modeler.fusion import Fuser, FusionVolume, Matcher, conditional_covariances
-from modeler.pipeline.pairs import register
-from modeler.pipeline.tracking import quick_registrar
+from modeler.pipeline.pairs import Registrations
 from modeler.priors.general import AnyMotion
 from modeler.priors.mixtures import KernelMixture
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.search import Search
 from modeler.types import (
-    AbstractRegistrar,
     Array,
     Edge,
     ElsewhereThanSegments,
@@ -99,14 +97,12 @@ class Alignment:
 class Joiner:
     """Joins segments: aligns their models, scores alignments by all views, and registers pairs of views."""
 
-    registrar: AbstractRegistrar = field(default_factory=VisibilityRegistrar)
+    registrations: Registrations = field(default_factory=lambda: Registrations(VisibilityRegistrar()))
     """Registers the pairs."""
     ready: Callable[[RayImage], RayImage] = lambda view: view
     """Returns a view with the images that a likelihood looks up."""
     pairs: int = 6
     """Number of pairs of views to register, one of each segment."""
-    seed: int = 0
-    """Each pair has its own random generator, seeded with this and the two frame numbers."""
 
     def join(self, target: Segment, source: Segment) -> list[Alignment]:
         """Return the possible alignments of two segments, likeliest first.
@@ -194,11 +190,11 @@ class Joiner:
 
     def _by_views(self, target: Segment, source: Segment) -> list[Array]:
         """Return alignments (4, 4) from registering pairs of views, some of each segment, without limits."""
-        registrar, prior = quick_registrar(self.registrar) or self.registrar, AnyMotion()
+        least_effort, prior = self.registrations.registrar.least_effort, AnyMotion()
         some = [self._spread(segment, _UNLIMITED_VIEWS) for segment in (target, source)]
         found = []
         for view, other in itertools.product(some[0].values(), some[1].values()):
-            posterior = register(registrar, other, view, prior.between(other, view), seed=self.seed)
+            posterior = self.registrations.register(other, view, prior.between(other, view), effort=least_effort)
             if posterior.usable:
                 found.append(_aligned(target, source, posterior))
         return found
@@ -217,7 +213,7 @@ class Joiner:
                 sigma_m=_ALIGNMENT_SIGMA_M,
                 evidence=False,
             )
-            posterior = register(self.registrar, *views, density, seed=self.seed).without_samples()
+            posterior = self.registrations.register(*views, density).without_samples()
             edges.append(self._judged(posterior, views, guess))
         return tuple(edges)
 
@@ -274,12 +270,12 @@ class Joiner:
     def _pair(self, source: RayImage, target: RayImage) -> PairLikelihood:
         """Return the likelihood of a pair of views."""
         return self._visibility.likelihood.between(
-            source, target, np.random.default_rng([self.seed, source.index, target.index])
+            source, target, np.random.default_rng([self.registrations.seed, source.index, target.index])
         )
 
     @property
     def _visibility(self) -> VisibilityRegistrar:
-        method = self.registrar.method
+        method = self.registrations.registrar
         return method if isinstance(method, VisibilityRegistrar) else VisibilityRegistrar()
 
     @property

@@ -9,12 +9,13 @@ from typing import TypeVar, final
 
 import numpy as np
 
-from modeler.closure import Closer
+from modeler.closure import Closer, Placement
 from modeler.concurrency import prefetching
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise
+from modeler.pipeline.attempts import Stage
 from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment
-from modeler.pipeline.pairs import Prepared, prepare, register, retry_unlimited
+from modeler.pipeline.pairs import Prepared, Registrations, prepare, without_limits
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import GeneralPrior
@@ -23,6 +24,7 @@ from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.suggestion import Belief, Candidate, Goal, Suggestions, suggest
 from modeler.types import (
+    AbstractPairCache,
     AbstractPrior,
     AbstractRegistrar,
     Edge,
@@ -76,11 +78,10 @@ class Modeler:
     common_distance: float = 0.001
     """Standard deviation of a bias of all distances, as a share of them, unless the focal length is exact. Loops do not
     observe it, and a larger value does not improve the calibration for cameras other than the renderer's."""
-    quick: AbstractRegistrar | None = None
-    """A cheap registrar for frames in which the object is probably hidden: the full search follows only if it finds a
-    match (see `quick_registrar`). None: full searches only."""
     seed: int = 0
     """Each pair has its own random generator, seeded with this and the two frame numbers."""
+    cache: AbstractPairCache | None = None
+    """Registrations of an interrupted run, if any."""
 
     def run(self, frames: Iterable[Frame], scene: Scene) -> Iterator[Event]:
         """Build a model and yield events: for each frame a `Step`, the last of which has the final model.
@@ -121,10 +122,11 @@ class Modeler:
         Raises:
             InputError: if the views lack what the prior needs.
         """
-        attempt = partial(self._register, self.registrar, source, target)
-        if prior is not None:
-            return attempt(prior)
-        return retry_unlimited(attempt(self.prior), self.prior, attempt)
+
+        def attempt(prior: AbstractPrior) -> Posterior:
+            return self.registrations.register(source, target, prior.between(source, target))
+
+        return attempt(prior) if prior is not None else without_limits(attempt(self.prior), self.prior, attempt)
 
     def suggest(
         self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None
@@ -155,19 +157,33 @@ class Modeler:
         prior = self.prior.learned(solution, edges)
         return Belief.of(views, solution, edges, prior, closer=self.closer, likelihood=likelihood, ready=ready)
 
+    @property
+    def registrations(self) -> Registrations:
+        """Registers pairs of views."""
+        return Registrations(self.registrar, self.seed, self.cache)
+
     def tracker(self, state: State) -> Tracker:
         """Return the tracker of a run in some state, with these components."""
-        quick_register = None if self.quick is None else partial(self._register, self.quick)
-        return Tracker(state, self.prior, self.closer, self.sensor, self.register, quick_register)
+        return Tracker(state, self.prior, self.closer, self.sensor, self.registrations)
 
     def joiner(self, tracker: Tracker) -> Joiner:
         """Return the joiner of segments of a run, with these components."""
-        return Joiner(self.registrar, tracker.ready, seed=self.seed)
+        return Joiner(self.registrations, tracker.ready)
 
-    def _register(
-        self, registrar: AbstractRegistrar, source: RayImage, target: RayImage, prior: AbstractPrior
-    ) -> Posterior:
-        return register(registrar, source, target, prior.between(source, target), seed=self.seed)
+
+@final
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A processed frame."""
+
+    state: State
+    """The state of the run after it."""
+    prepared: Prepared
+    """The frame, with the reason if it is left out."""
+    posteriors: tuple[Posterior, ...]
+    """Its registrations."""
+    edges: tuple[Edge, ...]
+    """These as edges, accepted or rejected."""
 
 
 @final
@@ -206,9 +222,10 @@ class Run:
             for prepared, last in ((one, False) for one in coming) if live else _with_last(coming):
                 found = prepared()
                 self.state = self.state.read(found)
-                yield from self._place(found, self.state.latest, last=last)
+                placed = yield from self._placed(self.state, found, self.state.latest, last=last)
+                yield self._after(placed)
 
-    def fill(self, frames: Iterable[Frame]) -> Iterator[Step]:
+    def fill(self, frames: Iterable[Frame]) -> Iterator[Step | Searching]:
         """Add frames that were skipped while tracking, each registered against the nearest in time; yield their steps.
 
         Args:
@@ -221,10 +238,10 @@ class Run:
             for preparation, _ in _with_last(map(preparing, frames)):  # reads one ahead, which is prepared meanwhile
                 prepared = preparation()
                 self.state = self.state.inserted(prepared)
-                tracker = self.modeler.tracker(self.state)
-                posteriors = () if prepared.view is None else tracker.between(prepared.view)
-                steps = self.state.steps(prepared.frame.index, posteriors[0].target) if posteriors else 1
-                yield from self._add(prepared, tracker, posteriors, steps=steps)
+                nearest = self.state.map_view.nearest_in_time(prepared.frame.index)
+                first = nearest[0] if nearest else None
+                placed = yield from self._placed(self.state, prepared, first, "fill")
+                yield self._after(placed)
 
     def revisit(self) -> Iterator[Step | Searching]:
         """Retry lost frames, newest first, against the views that followed them; yield steps of those placed."""
@@ -233,10 +250,10 @@ class Run:
             tried.add(pairs[0])
             frame, neighbour = pairs[0]
             yield Searching(frame)
-            lost = self.state.lost[frame]
-            assert lost.view is not None
-            view = self.modeler.tracker(self.state).ready(lost.view)
-            yield from self._place(replace(lost, view=view), neighbour, retry=True)
+            placed = yield from self._placed(self.state, self.state.lost[frame], neighbour, "revisit")
+            self.state = placed.state
+            if placed.prepared.accepted:
+                yield self._after(placed)
 
     def rejoin(self) -> Iterator[Step | Searching | Refining]:
         """Build segments of lost frames and join them with the rest; yield steps of their frames.
@@ -260,17 +277,9 @@ class Run:
 
         None if all steps share an axis: the noise common to the edges of a frame is not modelled together with it.
         """
-        if self.modeler.prior.shared_axis(list(self.state.views.values())) is not None:
-            return
-        yield Refining(0, None)
-        tracker, known = self.modeler.tracker(self.state), self.state.map_view
-        refined = {edge.source for edge in self.state.spans}
-        pairs = [pair for pair in self.modeler.closer.span_pairs(known) if pair[0] not in refined]
-        yield Refining(0, len(pairs))
-        for done, posterior in enumerate(tracker.spans(pairs), 1):
-            edge = self.modeler.closer.judge_span(posterior.without_samples(), known)
-            self.state = self.state.refined(tracker.explained([edge]))
-            yield Refining(done, len(pairs))
+        for state, event in self._refinement(self.state):
+            self.state = state
+            yield event
 
     def finish(self) -> Iterator[Step | Fusing]:
         """Solve the graph with the noise that its edges share, fuse the final model and yield the last step."""
@@ -287,24 +296,33 @@ class Run:
         last = self._step(newest, [edge.posterior for edge in spans], spans)
         yield replace(last, last=True, make_model=lambda: model)
 
-    def _segment(self, frames: Sequence[int]) -> Generator[Searching, None, State]:
+    def _refinement(self, state: State) -> Iterator[tuple[State, Refining]]:
+        """Yield a state with the edges of the refinement so far."""
+        if self.modeler.prior.shared_axis(list(state.views.values())) is not None:
+            return
+        yield state, Refining(0, None)
+        tracker, before = self.modeler.tracker(state), state.map_view
+        refined = {edge.source for edge in state.spans}
+        pairs = [pair for pair in self.modeler.closer.span_pairs(before) if pair[0] not in refined]
+        yield state, Refining(0, len(pairs))
+        for done, posterior in enumerate(tracker.between_views(pairs), 1):
+            edge = self.modeler.closer.judge_span(posterior.without_samples(), before)
+            state = state.refined(tracker.explained([edge]))
+            yield state, Refining(done, len(pairs))
+
+    def _segment(self, frames: Sequence[int]) -> Generator[Searching | Refining, None, State]:
         """Register lost frames among each other and return their state; the first two that match start the segment."""
-        subset, tracker = self.state.subset(frames), self.modeler.tracker(self.state)
-        part = Run(self.modeler, self.scene, subset)
+        subset = part = self.state.subset(frames)
         for frame in frames:
             yield Searching(frame)
-            lost = self.state.lost[frame]
-            assert lost.view is not None
-            lost = replace(lost, view=tracker.ready(lost.view), left_out=None)
-            for _ in part._place(lost, part.state.latest, last=frame == frames[-1]):
-                pass
-            if frame not in part.state.views and len(part.state.views) == 1:  # the first may show the object in a hand
-                part.state = subset
-                for _ in part._place(lost, None):
-                    pass
-        for _ in part.refine():
-            pass
-        return part.state.with_spans()
+            lost = replace(self.state.lost[frame], left_out=None)
+            part = (yield from self._placed(part, lost, part.latest, last=frame == frames[-1])).state
+            if frame not in part.views and len(part.views) == 1:  # the first may show the object in a hand
+                part = (yield from self._placed(subset, lost, None)).state
+        for refined, event in self._refinement(part):
+            part = refined
+            yield event
+        return part.with_spans()
 
     def _joined(self, segment: State) -> Iterator[Step]:
         """Join a segment with the views so far, if possible; yield steps of its frames."""
@@ -324,52 +342,38 @@ class Run:
             edges = [edge for edge in (*segment.graph.edges, *joins) if edge.source == frame]
             yield self._step(replace(lost[frame], left_out=left_out), [edge.posterior for edge in edges], edges)
 
-    def _place(
-        self, prepared: Prepared, previous: int | None, *, last: bool = False, retry: bool = False
-    ) -> Iterator[Step | Searching]:
-        """Register a frame, add it to the graph and to the model, and yield its step.
+    def _placed(
+        self, state: State, prepared: Prepared, first: int | None, stage: Stage = "track", *, last: bool = False
+    ) -> Generator[Searching, None, Placed]:
+        """Register a frame and add it to the graph.
 
         Args:
+            state: before it.
             prepared: the frame.
-            previous: the view to register it against first, if any.
+            first: number of the view to register it against first, if any.
+            stage: whose attempts are made.
             last: whether it is the last of the sequence.
-            retry: whether it was lost before: then it has a step only if it is placed.
         """
-        tracker, posteriors = self.modeler.tracker(self.state), ()
-        if prepared.view is not None and previous is not None:
-            posteriors = yield from tracker.locate(prepared.view, previous, retry=retry)
-            posteriors += tracker.closures(prepared.view, posteriors, last=last, retry=retry)
-        steps = self.state.steps(prepared.frame.index, previous)
-        yield from self._add(prepared, tracker, posteriors, steps=steps, retry=retry)
-
-    def _add(
-        self,
-        prepared: Prepared,
-        tracker: Tracker,
-        posteriors: tuple[Posterior, ...],
-        *,
-        steps: int,
-        retry: bool = False,
-    ) -> Iterator[Step]:
-        """Add a frame with its registrations to the graph and to the model, and yield its step.
-
-        Args:
-            prepared: the frame.
-            tracker: which registered it.
-            posteriors: the registrations.
-            steps: number of frames from the first one's target.
-            retry: whether it was lost before: then it has a step only if it is placed.
-        """
+        tracker, closer, number = self.modeler.tracker(state), self.modeler.closer, prepared.frame.index
+        view = None if prepared.view is None else tracker.ready(prepared.view)
+        posteriors, placement = (), Placement()
+        if view is not None and first is not None:
+            posteriors, placement = yield from tracker.place(view, first, stage)
+            if placement.base is not None and stage != "fill":
+                posteriors += tracker.closures(view, posteriors, placement.base, last=last)
         compact = [posterior.without_samples() for posterior in posteriors]
-        edges = tracker.explained(self.modeler.closer.judge(compact, self.state.map_view, steps=steps))
-        prepared = replace(prepared, left_out=_reason_left_out(prepared, edges, first=not self.state.views))
-        self.state = self.state.joined(prepared, edges)
-        if prepared.accepted:
-            number = prepared.frame.index
-            if self.modeler.closer.is_keyframe(number, self.state.map_view):
-                self.state = replace(self.state, keyframes=(*self.state.keyframes, number))
-        if prepared.accepted or not retry:
-            yield self._step(prepared, posteriors, edges)
+        edges = closer.judge(compact, placement, state.map_view, steps=state.steps(number, first))
+        edges = tracker.explained(edges)
+        prepared = replace(prepared, view=view, left_out=_reason_left_out(prepared, edges, first=not state.views))
+        state = state.joined(prepared, edges)
+        if prepared.accepted and closer.is_keyframe(number, state.map_view):
+            state = replace(state, keyframes=(*state.keyframes, number))
+        return Placed(state, prepared, posteriors, edges)
+
+    def _after(self, placed: Placed) -> Step:
+        """Continue from the state after a frame, and return its event."""
+        self.state = placed.state
+        return self._step(placed.prepared, placed.posteriors, placed.edges)
 
     def _solve(self) -> None:
         """Solve the graph with what its edges share: an axis of all steps or else noise, and the focal length.
@@ -406,7 +410,7 @@ class Run:
             nonlocal state, at
             if log_factor != at:
                 moved = state.under(log_factor - at, sensor)
-                state, at = moved.reregistered(self.modeler.tracker(moved).spans), log_factor
+                state, at = moved.reregistered(self.modeler.tracker(moved).between_views), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
         focal = estimate_focal_length(estimate_at, rounds=_FOCAL_ROUNDS, reach=_FOCAL_REACH * sigma)

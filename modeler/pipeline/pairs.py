@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
 from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
+    AbstractPairCache,
     AbstractPoseDensity,
     AbstractPrior,
     AbstractRegistrar,
@@ -63,28 +65,37 @@ def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) ->
     return Prepared(frame, segmentation, view if len(view.points_m) else None)
 
 
-def register(
-    registrar: AbstractRegistrar, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, seed: int
-) -> Posterior:
-    """Return the posterior of target_from_source.
+@final
+@dataclass(frozen=True, eq=False)
+class Registrations:
+    """Registers pairs of views, each with a random generator of its own."""
 
-    Args:
-        registrar: the method.
-        source: one view.
-        target: another.
-        density: prior density of target_from_source.
-        seed: of the pair's random generator, together with the two frame numbers.
-    """
-    rng = np.random.default_rng([seed, source.index, target.index])
-    return registrar.register(source, target, density, rng=rng)
+    registrar: AbstractRegistrar
+    """The method."""
+    seed: int = 0
+    """Seeds the generator of a pair, together with the two frame numbers."""
+    cache: AbstractPairCache | None = None
+    """Results of an interrupted run, if any."""
+
+    def register(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, effort: float = 1.0
+    ) -> Posterior:
+        """Return the posterior of target_from_source.
+
+        Args:
+            source: one view.
+            target: another.
+            density: prior density of target_from_source.
+            effort: share (0..1] of the usual effort.
+        """
+        rng = np.random.default_rng([self.seed, source.index, target.index])
+        if self.cache is None:
+            return self.registrar.register(source, target, density, rng=rng, effort=effort)
+        return self.cache.register(self.registrar, source, target, density, rng=rng, effort=effort)
 
 
-def retry_unlimited(
-    within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]
-) -> Posterior:
+def without_limits(within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]) -> Posterior:
     """Return a registration, or one without limits if it is not convincing and the prior's limits are defaults.
-
-    If several modes are found, none within the usual limits, none can be trusted: only a converged result counts.
 
     Args:
         within: the registration with the prior.
@@ -95,5 +106,12 @@ def retry_unlimited(
     if unlimited is None:
         return within
     other = attempt(unlimited)
-    found = other if other.outcome is Outcome.CONVERGED else within
-    return replace(found, seconds=within.seconds + other.seconds)
+    return replace(converged_or(within, other), seconds=within.seconds + other.seconds)
+
+
+def converged_or(within: Posterior, unlimited: Posterior) -> Posterior:
+    """Return the registration without limits if it converged, else the one within limits.
+
+    If several modes are found, none within the usual limits, none can be trusted.
+    """
+    return unlimited if unlimited.outcome is Outcome.CONVERGED else within

@@ -141,12 +141,43 @@ class AbstractRegistrar(ABC):
     """A registration method: parameters as fields, one pure method."""
 
     @property
-    def method(self) -> AbstractRegistrar:
-        """The registrar itself, without a cache around it."""
-        return self
+    def least_effort(self) -> float:
+        """The least effort at which registering costs less than with more; by default 1: there is one way only."""
+        return 1.0
 
     @abstractmethod
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
-        """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception."""
+        """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception.
+
+        Args:
+            source: one view.
+            target: another.
+            density: prior density of target_from_source.
+            rng: source of all randomness.
+            effort: share (0..1] of the usual effort, for pairs that may share no surface.
+        """
+
+
+class AbstractPairCache(ABC):
+    """Results of registrations that need not be repeated."""
+
+    @abstractmethod
+    def register(
+        self,
+        registrar: AbstractRegistrar,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float,
+    ) -> Posterior:
+        """Return the stored result of the same registration, or else register and store it."""

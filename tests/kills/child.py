@@ -53,9 +53,9 @@ def _note(kind: Any, notes: int) -> None:
     """Let a registrar tell of every pair that it begins with."""
     register = kind.register
 
-    def noted(self: Any, source: Any, target: Any, density: Any, *, rng: Any) -> Any:
+    def noted(self: Any, source: Any, target: Any, density: Any, **options: Any) -> Any:
         os.write(notes, f"pair {source.index} {target.index}\n".encode())
-        return register(self, source, target, density, rng=rng)
+        return register(self, source, target, density, **options)
 
     kind.register = noted
 

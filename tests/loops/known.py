@@ -26,7 +26,13 @@ class Known(AbstractRegistrar):
     """Standard deviation of the object's place along each axis."""
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         """Return the posterior of target_from_source."""
         sigmas = np.repeat([np.radians(self.sigma_deg), self.sigma_m], 3)

@@ -24,7 +24,13 @@ class Lying(AbstractRegistrar):
     """Lies are turned about the object by so much at least; 180 at most."""
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         """Return the posterior of target_from_source, or a lie with the truth's covariance, evidence and overlap."""
         posterior = self.registrar.register(source, target, density, rng=rng)

@@ -18,7 +18,7 @@ from modeler.closure import Closer
 from modeler.evaluation import nees, trajectory_errors, true_motion
 from modeler.fusion import Fuser
 from modeler.graph import PoseGraph, solve
-from modeler.pipeline import Modeler, quick_registrar
+from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
@@ -79,7 +79,6 @@ def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, 
         sensor=Sensor() if noise is None else Sensor(*noise),
         prior=TablePrior() if case.prior == "table" else GeneralPrior(),
         registrar=Lying(registrar, lies) if lies else registrar,
-        quick=None if lies or truth is not None else quick_registrar(registrar),
         closer=closer,
         fuser=Fuser(voxel_m=0.01),
         seed=seed,

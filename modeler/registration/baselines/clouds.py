@@ -245,7 +245,13 @@ class AbstractCloudRegistrar(AbstractRegistrar):
         """
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         """Return the fit from the prior's centre; directions that the surfaces leave open have the prior's spread.
 

@@ -53,7 +53,13 @@ class PaperRegistrar(AbstractRegistrar):
     """Device that draws, tests and weights samples."""
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
         """Return the posterior of target_from_source; its outcome states failure."""
         started = time.perf_counter()

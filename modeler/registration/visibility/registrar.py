@@ -33,6 +33,8 @@ from modeler.types import (
     pooled,
 )
 
+_LEAST_EFFORT = 0.25  # 0.5 s of 2 s for a pair without common surface
+
 
 @dataclass(frozen=True, eq=False)
 class ModeSamples:
@@ -69,10 +71,36 @@ class VisibilityRegistrar(AbstractRegistrar):
     max_sigma_deg: float = 10.0
     """Largest standard deviation of a rotation that is not ambiguous."""
 
+    @property
+    def least_effort(self) -> float:
+        """A quarter of the usual effort."""
+        return _LEAST_EFFORT
+
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, rng: np.random.Generator
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
     ) -> Posterior:
-        """Return the posterior of target_from_source; its outcome states failure."""
+        """Return the posterior of target_from_source; its outcome states failure.
+
+        With less than full effort, only the best mode is sampled: pairs that share no surface are the most expensive,
+        as every mode that the search finds is sampled.
+        """
+        method = self if effort == 1.0 else self.scaled(effort)
+        return method._registered(source, target, density, rng)
+
+    def scaled(self, effort: float) -> VisibilityRegistrar:
+        """Return the method with a share (0..1] of the starts of a search and of the samples, of one mode."""
+        sampler = replace(self.sampler, max_draws=int(effort * self.sampler.max_draws))
+        return replace(self, search=self.search.scaled(effort), sampler=sampler, max_modes=1)
+
+    def _registered(
+        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator
+    ) -> Posterior:
         started = time.perf_counter()
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
