@@ -17,9 +17,9 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.graph.covariance import Rows, chi_square_quantile
 from modeler.graph.pose_graph import Factor, inverse_right_jacobian
+from modeler.priors.common_axis import MIN_TURN_RAD
 from modeler.types import Array, segments
 
-_MIN_TURN_RAD = np.radians(5.0)  # total rotation below which the axis is not observable
 _SLIP = [0, 1, 3, 4, 5]  # components of ξ other than the rotation about the axis
 _AXIS = gtsam.symbol("a", 0)  # beyond all frame numbers
 # Standard deviations of A about its initial estimate, rad and m. The rotation about the axis is not observable and is
@@ -63,7 +63,7 @@ def estimated_axis(
     pairs = list(itertools.pairwise(sorted(trajectory))) if pairs is None else pairs
     steps = np.stack([se3.inverse(trajectory[t]) @ trajectory[s] for t, s in pairs])
     rotations = se3.log(steps)[:, :3]
-    if np.sum(np.linalg.norm(rotations, axis=1)) < _MIN_TURN_RAD:
+    if np.sum(np.linalg.norm(rotations, axis=1)) < MIN_TURN_RAD:
         return None
     axis = np.linalg.svd(rotations)[2][0]
     axis = axis if np.sum(rotations @ axis) > 0.0 else -axis

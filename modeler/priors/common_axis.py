@@ -13,7 +13,7 @@ from modeler.priors.mixtures import across_axis
 from modeler.types import Array, PoseGaussian, Posterior
 
 _MIN_PAIRS, _MAX_PAIRS = 3, 60  # of many, the latest suffice
-_MIN_TURN_RAD = np.radians(5.0)
+MIN_TURN_RAD = np.radians(5.0)  # below, a turn says little of its axis
 _FREEDOM = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
 _ITERATIONS = 30
 _DECISIVE_LOG_ODDS = np.log(500.0)  # log odds from which the sense counts as known: three certain pairs yield 9³
@@ -47,7 +47,7 @@ def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: fl
         wobble_rad: standard deviation of each motion's rotation out of the axis.
         wobble_m: standard deviation of its shift, at the axis' point.
     """
-    turning = [motion for motion in motions if np.linalg.norm(se3.log(motion.mean)[:3]) >= _MIN_TURN_RAD]
+    turning = [motion for motion in motions if np.linalg.norm(se3.log(motion.mean)[:3]) >= MIN_TURN_RAD]
     turning = turning[-_MAX_PAIRS:]
     if len(turning) < _MIN_PAIRS:
         return None

@@ -111,10 +111,15 @@ class GeneralDensity(AbstractPoseDensity):
 def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
     """Return the limits of rotation in degrees and of the centroids' offset in m for a number of steps (at least 1).
 
-    The rotation is capped, as views farther apart share too little surface to be registered. Offsets add up.
+    The rotation is capped, as views farther apart share too little surface to be registered.
     """
     rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _LARGE_DEG))
-    return rotation_deg, min(steps * max_offset_m, MAX_LENGTH_M)
+    return rotation_deg, relaxed_offset_m(max_offset_m, steps)
+
+
+def relaxed_offset_m(max_offset_m: float, steps: float) -> float:
+    """Return the limit of the centroids' offset in m for a number of steps (at least 1): offsets add up."""
+    return min(steps * max_offset_m, MAX_LENGTH_M)
 
 
 def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:

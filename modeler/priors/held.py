@@ -9,11 +9,10 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.checks import ParameterError, check_parameters
-from modeler.priors.general import GeneralPrior, reach_deg, relaxed_limits, turned_offset_m
+from modeler.priors.general import GeneralPrior, reach_deg, relaxed_offset_m, turned_offset_m
 from modeler.priors.mixtures import Alternatives, KernelMixture, defensive_mixture
 from modeler.types import AbstractPoseDensity, AbstractPrior, Edge, HandPoses, RayImage, Solution
 
-_STEP_DEG = 25.0  # step to which `max_offset_m` refers
 _REGRASPED_SHARE = 0.5  # of the samples: either may be true, and the search must cover both
 
 
@@ -40,7 +39,7 @@ class HeldPrior(AbstractPrior):
     """Prior of the object's motion in a regrasp; evidence."""
     steps: float = 1.0
     """Number of steps of a motion."""
-    max_offset_m: float = 0.04
+    max_offset_m: float = GeneralPrior.max_offset_m
     """Largest distance between the centroids if the hand is only a proposal (returns to earlier views); it grows with
     turns beyond 30 degrees."""
     previous: int | None = None
@@ -83,7 +82,7 @@ class HeldPrior(AbstractPrior):
 
     def relaxed(self, steps: float) -> HeldPrior:
         """Return the prior with limits for several steps; their motion is the hand's unless it regrasps."""
-        offset_m = relaxed_limits(_STEP_DEG, self.max_offset_m, steps)[1]
+        offset_m = relaxed_offset_m(self.max_offset_m, steps)
         return replace(self, max_offset_m=offset_m, regrasped=self.regrasped.relaxed(steps), steps=steps * self.steps)
 
     def unlimited(self) -> HeldPrior | None:

@@ -13,7 +13,7 @@ from modeler import se3
 from modeler.priors.checks import check_covariance
 from modeler.types import AbstractPoseDensity, Array
 
-_NODES = 4097
+NODES = 4097  # of a tabulated distribution function: a thousand times finer than a standard deviation
 _OVERLAP_SAMPLES = 4096  # by which the fraction of a proposal's mass within the support is estimated
 _MIN_OVERLAP = 0.01  # proposals with a smaller fraction are dropped
 
@@ -190,7 +190,7 @@ class KernelMixture(AbstractPoseDensity):
     @cached_property
     def _angles(self) -> tuple[Array, Array]:
         """Angles (m,) of the kernel's rotations, and their distribution function (m,)."""
-        angles = np.linspace(0.0, min(np.pi, 10.0 * self.sigma_rad), _NODES)
+        angles = np.linspace(0.0, min(np.pi, 10.0 * self.sigma_rad), NODES)
         fall = 2.0 * np.sin(0.5 * angles) ** 2  # 1 - cos θ, without cancellation
         density = fall * np.exp(-self._concentration * fall)
         cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])

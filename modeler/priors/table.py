@@ -9,7 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.checks import check_parameters
-from modeler.priors.general import AnyMotion, centroid_offset, relaxed_limits
+from modeler.priors.general import AnyMotion, GeneralPrior, centroid_offset, relaxed_limits
 from modeler.priors.mixtures import across_axis
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage
 
@@ -130,7 +130,7 @@ def support(source: RayImage, target: RayImage) -> Plane | None:
 class TablePrior(AbstractPrior):
     """Motion in the support plane, with the plane's own uncertainty."""
 
-    max_rotation_deg: float = 50.0
+    max_rotation_deg: float = GeneralPrior.max_rotation_deg
     """Largest rotation about the plane's normal between the two views."""
     max_shift_m: float = 0.05
     """Largest distance, in the plane, between the target's centroid and the source's, transformed."""

@@ -12,8 +12,8 @@ import numpy as np
 from modeler import se3
 from modeler.priors.checks import check_parameters
 from modeler.priors.common_axis import Axis, common_axis, turn_sense
-from modeler.priors.general import GeneralPrior, centroid_offset, reach_deg, relaxed_limits, turned_offset_m
-from modeler.priors.mixtures import defensive_mixture, directions_about
+from modeler.priors.general import GeneralPrior, centroid_offset, reach_deg, relaxed_offset_m, turned_offset_m
+from modeler.priors.mixtures import NODES, defensive_mixture, directions_about
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, TablePrior, no_plane, sample_disc, support
 from modeler.types import (
     AbstractPoseDensity,
@@ -28,11 +28,9 @@ from modeler.types import (
 )
 
 _REACH = 8.0  # standard deviations of the turn that are sampled
-_NODES = 4097
 _UP = (0.0, -1.0, 0.0)  # opposite to gravity for an upright camera: y points down
-_BROAD_DEG, _GIVEN_DEG = 30.0, 1.0
+_BROAD_DEG, _GIVEN_DEG = 30.0, 1.0  # sd of an upright camera's up, which adds little to the steps; of a given axis
 _FLOOR = 1e-5  # of standard deviations in rad or m: keeps densities finite if 0 is given
-_UNKNOWN_DEG = 20.0  # standard deviation of a direction that adds little to the information of the steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +114,7 @@ class AxisTurn:
     @cached_property
     def _turns(self) -> tuple[Array, float, Array]:
         """Offsets (k,) of the turn from its mean, the normaliser due to wobble, and their CDF (k,)."""
-        offsets = np.linspace(-_REACH, _REACH, _NODES) * self.sigma_turn_rad
+        offsets = np.linspace(-_REACH, _REACH, NODES) * self.sigma_turn_rad
         measure = spread(self.turn_rad + offsets)
         density = np.exp(-0.5 * (offsets / self.sigma_turn_rad) ** 2) * measure / (measure + self.sigma_wobble_rad**2)
         cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
@@ -271,7 +269,7 @@ class TurntablePrior(AbstractPrior):
     about the camera's up (-y). 180 or more: any direction."""
     axis_sigma_m: float = 0.005
     """Standard deviation of the axis' point, orthogonal to the axis, if one is given."""
-    max_shift_m: float = 0.05
+    max_shift_m: float = TablePrior.max_shift_m
     """Largest distance, orthogonal to the axis, between the target's centroid and the source's, transformed; it grows
     with turns beyond 30 degrees."""
     wobble_deg: float = WOBBLE_DEG
@@ -314,8 +312,7 @@ class TurntablePrior(AbstractPrior):
 
     def relaxed(self, steps: float) -> TurntablePrior:
         """Return the prior with limits for several steps; their turn follows from the frame numbers."""
-        step_deg = min(max(abs(self.step_deg), 1.0), 180.0)
-        return replace(self, max_shift_m=relaxed_limits(step_deg, self.max_shift_m, steps)[1])
+        return replace(self, max_shift_m=relaxed_offset_m(self.max_shift_m, steps))
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> TurntablePrior:
         """Return the prior with the common axis and sense of rotation of the pairs so far."""
@@ -337,7 +334,7 @@ class TurntablePrior(AbstractPrior):
         """
         if self.axis_point_m is not None:
             return None
-        unknown = all(self._axis(view.plane).sigma_direction_rad >= np.radians(_UNKNOWN_DEG) for view in views)
+        unknown = all(self._axis(view.plane).sigma_direction_rad >= np.radians(_BROAD_DEG) for view in views)
         return SharedAxis(float(np.radians(self.wobble_deg)) if unknown else np.inf, self.wobble_m)
 
     def _sense(self, posteriors: Sequence[Posterior]) -> int:

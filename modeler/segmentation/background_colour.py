@@ -25,11 +25,9 @@ _LEAST_FRAMES = 3  # in which a pixel must show the background for a known colou
 _LEAST_SIGMA = 3.0  # of 255 levels: noise of a colour camera indoors
 _DARKEST, _BRIGHTEST = 0.7, 1.1  # of the background, by shadows of the object and by exposure
 _BINS = 64  # of red and of green chromaticity: a bin is three levels of a grey pixel wide
-_TINT = 2.0  # bins: change of chromaticity by light from different sides, 6 levels of a grey pixel
-_APART = 4.0  # bins between different chromaticities
+_TINT = 2.0  # bins: change of chromaticity by light from different sides, 6 levels of grey; twice as much: another one
 _PRIOR_ODDS = 0.02  # of background at a pixel that has the object's depth: 6 % of `figure`, under 2 % of six captures
 _LEAST_SHARE = 0.3  # of the object's pixels, with another colour behind them: else its frequency is unknown
-_SPECK_SHARE = 0.003  # of the object's pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,7 @@ def without_background(mask: BoolArray, frame: Frame, background: BackgroundColo
     if background is None or frame.colour is None:
         return mask
     shown = background.shown(frame.colour, mask)
-    return without_specks(mask & ~shown, _SPECK_SHARE) if shown.any() else mask
+    return without_specks(mask & ~shown) if shown.any() else mask
 
 
 def _object_density(colours: npt.NDArray[np.uint8], behind: Float32Array) -> Array:
@@ -110,12 +108,13 @@ def _object_density(colours: npt.NDArray[np.uint8], behind: Float32Array) -> Arr
         colours: (n, 3) RGB of pixels that are the object's, or between its limbs.
         behind: (n, 3) RGB of the background there.
     """
-    apart = np.linalg.norm(_chromaticity(colours) - _chromaticity(behind), axis=1) > _APART / _BINS
+    other = 2.0 * _TINT
+    apart = np.linalg.norm(_chromaticity(colours) - _chromaticity(behind), axis=1) > other / _BINS
     of_colour, of_background = np.zeros((_BINS, _BINS)), np.zeros((_BINS, _BINS))
     np.add.at(of_colour, tuple(_bins(colours[apart])), 1.0)
     np.add.at(of_background, tuple(_bins(behind)), 1.0)
-    x, y = np.mgrid[-_APART : _APART + 1, -_APART : _APART + 1]
-    alike = ndimage.convolve(of_background, (np.hypot(x, y) <= _APART).astype(float), mode="constant")
+    x, y = np.mgrid[-other : other + 1, -other : other + 1]
+    alike = ndimage.convolve(of_background, (np.hypot(x, y) <= other).astype(float), mode="constant")
     chances = len(colours) - alike
     of_colour = ndimage.gaussian_filter(of_colour, _TINT, mode="constant") + 1.0 / _BINS  # of a colour not seen yet
     known = chances > _LEAST_SHARE * len(colours)

@@ -12,12 +12,13 @@ from scipy import ndimage
 
 from modeler.types import Array, BoolArray, Camera, Float32Array
 
+MOST = 0.5  # the majority of pixels, frames or a rim
+STRAY_WEIGHT = 0.2  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
 _OUTLIERS_IN = 7  # one measurement in this many may lie behind the background by error
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
 _STILL_SHARE = 0.7  # share of agreeing measurements at a static pixel
 _MOVED_SHARE = 0.15  # share of measurements in front of the background at a pixel that moved
-_MOVING_CAMERA_SHARE = 0.5  # of the pixels changing in this share of the frames: then the camera moves, not the object
 _QUARTERS_APART = 1.35  # standard deviations from the lower to the upper quartile of a Gaussian
 Labels = npt.NDArray[np.int32]
 _JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
@@ -26,7 +27,7 @@ _GRAZING = np.tan(np.radians(85.0))  # surfaces at a more grazing angle are indi
 _SEEN_SHARE = 0.4  # share of measurements in a row or column that is not blind
 _BLIND_SHARE = 0.01  # share of measurements in a blind band
 _RAGGED_SHARE = 0.02  # share of the image by which the edge of a blind band may bend after undistortion
-_EVERYWHERE = np.ones((3, 3, 3), dtype=np.bool_)
+_SPECK_SHARE = 0.003  # share of a mask; smaller pieces are removed
 
 
 @final
@@ -76,12 +77,12 @@ class Layers:
     @property
     def changes_widely(self) -> bool:
         """Whether much of the image changes: the camera moves, depth is noisier than expected, or people walk past."""
-        return bool(np.count_nonzero(self.moved) > _MOVING_CAMERA_SHARE * self._seen)
+        return bool(np.count_nonzero(self.moved) > MOST * self._seen)
 
     @property
     def camera_moves(self) -> bool:
         """Whether much of the image changes, and often: who walks past changes each pixel in few of the frames."""
-        often = float(self.front_share[self.moved].sum()) > _MOVING_CAMERA_SHARE**2 * self._seen
+        often = float(self.front_share[self.moved].sum()) > MOST**2 * self._seen
         return self.changes_widely and often
 
     @property
@@ -185,7 +186,7 @@ def voxel_clusters(points: npt.NDArray[np.floating], *, low_m: Array, high_m: Ar
     cell = ((points - low_m.astype(points.dtype)) / points.dtype.type(side)).astype(np.int32)
     filled = np.zeros(tuple(((high_m - low_m) / side).astype(np.int64) + 2), dtype=np.bool_)
     filled[cell[:, 0], cell[:, 1], cell[:, 2]] = True
-    return _label(filled, structure=_EVERYWHERE)[cell[:, 0], cell[:, 1], cell[:, 2]]
+    return _label(filled, structure=ndimage.generate_binary_structure(3, 3))[cell[:, 0], cell[:, 1], cell[:, 2]]
 
 
 def mixed_pixels(depth_m: Float32Array, *, tolerance_m: Float32Array, pixel_m: Float32Array) -> BoolArray:
@@ -203,7 +204,7 @@ def mixed_pixels(depth_m: Float32Array, *, tolerance_m: Float32Array, pixel_m: F
     return (depth_m - nearest > jump) & (farthest - depth_m > jump)
 
 
-def without_specks(mask: BoolArray, least_share: float) -> BoolArray:
+def without_specks(mask: BoolArray, least_share: float = _SPECK_SHARE) -> BoolArray:
     """Return a mask (h, w) without structures one pixel wide and without pieces below a share of its pixels."""
     count = np.pad(mask.astype(np.uint8), 1)
     count = count[:-2] + count[1:-1] + count[2:]

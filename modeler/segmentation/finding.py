@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.segmentation.depth_images import (
+    STRAY_WEIGHT,
     DepthNoise,
     Labels,
     mixed_pixels,
@@ -28,14 +29,11 @@ Window = tuple[slice, slice]
 _ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
 _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
 _LEAST_PIECE = 0.07  # of the object; false depth filled in around a figure's limbs has pieces of up to 6 %
-_STRAY_WEIGHT = 0.2  # weight of pixels outside the zone, and of pieces that extend from the image's edge as arms do
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
 _CLEARANCE_M = 0.001
 _MOVED_M = 0.02  # of an object's outline between the frames from which its scene is learned
-_LOW_M = 0.01  # creases of the support are at most so high, and apart from the object
+_CREASE_M = 0.01  # creases of the support are at most so high, and so far from the object
 _LOW_SHARE = 0.3  # share of the object's height, for flat objects
-_LOW_REACH_M = 0.01
-_SPECK_SHARE = 0.003
 _CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
 AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
 
@@ -167,9 +165,9 @@ def _choose(
     labels, in_zone = part.clusters(fore), _inside(part.points[fore], *zone_m)
     labels = _split(labels, _mostly(~in_zone, labels), part.depth_m, fore)
     area_m2, static = part.pixel_m2[fore], part.static(scene, noise)[fore]
-    merit = np.bincount(labels, area_m2 * np.where(in_zone, 1.0, _STRAY_WEIGHT))
-    merit[_many(part.on_edge[fore], labels)] *= _STRAY_WEIGHT
-    merit[_mostly(static, labels)] *= _STRAY_WEIGHT
+    merit = np.bincount(labels, area_m2 * np.where(in_zone, 1.0, STRAY_WEIGHT))
+    merit[_many(part.on_edge[fore], labels)] *= STRAY_WEIGHT
+    merit[_mostly(static, labels)] *= STRAY_WEIGHT
     best = int(merit.argmax())
     chosen[part.window][fore] = labels == best
     blocking = chosen.copy() if occluder is None else chosen | occluder[::stride, ::stride]
@@ -324,10 +322,10 @@ def _refine(
     if not fore.any():
         return mask
     if above_m is not None:
-        fore &= _not_a_crease(above_m, fore, _LOW_REACH_M * camera.fx / float(np.median(depth[fore])))
+        fore &= _not_a_crease(above_m, fore, _CREASE_M * camera.fx / float(np.median(depth[fore])))
     pixel = depth / np.float32(camera.fx)
     fore &= ~mixed_pixels(depth, tolerance_m=noise.tolerance_m(depth), pixel_m=pixel)
-    mask[window] = without_specks(fore, _SPECK_SHARE)
+    mask[window] = without_specks(fore)
     return mask
 
 
@@ -374,7 +372,7 @@ def _foreground(
 
 def _not_a_crease(height_m: Float32Array, fore: BoolArray, reach_px: float) -> BoolArray:
     """Return the pixels (h, w) that are high above the support or near some that are."""
-    low = min(_LOW_M, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
+    low = min(_CREASE_M, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
     high = (fore & (height_m > low)).astype(np.uint8)
     near: BoolArray = ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
     return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)  # a crease surrounds the object

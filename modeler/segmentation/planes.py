@@ -18,7 +18,7 @@ Real = TypeVar("Real", bound=np.floating[Any])
 _SYSTEMATIC_TILT_RAD = 0.005
 _SYSTEMATIC_OFFSET_M = 0.0005
 _SYSTEMATIC_SHARE = 0.001  # scale error of the depth, relative to the distance of the foot
-_MIN_POINTS = 50
+_MIN_POINTS = 50  # of a plane, and of the ground seen on it
 _TRIM = 3.0  # standard deviations
 _ROUNDING_M = 1e-6
 _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
@@ -34,7 +34,6 @@ _LEVEL_BONUS = 1.5  # factor on the votes for level planes
 _PARALLEL = np.cos(np.radians(6.0))  # between the normals of parallel planes, given the accuracy of small ones
 _ABOVE_SHARE = 0.98  # share of an object above its support
 _REACH_SIZES = 1.5  # radius of an object's surroundings, in sizes of the object
-_LEAST_SEEN = 50  # points
 _MAX_GROUND = 6000  # points; more do not help, since their errors are correlated
 
 
@@ -246,7 +245,7 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
         seen = np.count_nonzero(np.abs(heights(ground, plane)) < np.median(tolerance))
         holds = np.mean(height > -tolerance) > _ABOVE_SHARE and np.percentile(height, 5) < 0.5 * size
         merit = (int(grade), -float(np.median(height)))
-        if seen >= _LEAST_SEEN and holds and merit > best:
+        if seen >= _MIN_POINTS and holds and merit > best:
             best, found = merit, plane
     return found
 

@@ -13,6 +13,8 @@ from scipy import ndimage
 from modeler.range_noise import RangeNoise
 from modeler.segmentation.background_colour import BackgroundColour
 from modeler.segmentation.depth_images import (
+    MOST,
+    STRAY_WEIGHT,
     DepthNoise,
     Labels,
     Layers,
@@ -42,12 +44,9 @@ _ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere from which the o
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
 _TOUCHING_PX = 3
-_CUT_WEIGHT = 0.2  # of a moving piece that extends from the image's edge: an arm, or a person
-_MOST = 0.5  # share of measured pixels; with more there is a background
 _ON_BORDER = 0.005  # share of measured pixels along the image's edge; with more the scene extends beyond it
 _ON_PLANE, _ABOVE, _BELOW = 0.1, 0.01, 0.2  # shares of the points: at least, at least, and at most for a support plane
 _MOSTLY = 0.7  # share of the frames
-_SPECK_SHARE = 0.003  # share of the object; smaller pieces are removed
 
 
 @final
@@ -132,14 +131,14 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     labels = pieces(depth, layers.moved & allowed)
     merit = _central(labels, depth, layers.front_share)
     cut = np.bincount(labels[edge_of(np.isfinite(depth))], minlength=len(merit)) >= _TOUCHING_PX
-    merit[cut] *= _CUT_WEIGHT
+    merit[cut] *= STRAY_WEIGHT
     if merit.max() <= 0.0:
         return np.zeros_like(layers.moved), True
     low, high = np.percentile(layers.front_m[labels == int(merit.argmax())], [2.0, 98.0], axis=0)
     margin = _NEIGHBOUR_SIZES * float(np.linalg.norm(high - low))
     near = ((layers.front_m > low - margin) & (layers.front_m < high + margin)).all(axis=-1)
     elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share)
-    elsewhere[cut[: len(elsewhere)]] *= _CUT_WEIGHT
+    elsewhere[cut[: len(elsewhere)]] *= STRAY_WEIGHT
     regions = np.zeros(depth.shape, dtype=np.int32)
     ndimage.label(layers.moved & allowed & near, output=regions)
     merit_of = _central(regions, depth, layers.front_share)
@@ -250,13 +249,13 @@ def is_island(depth_m: Float32Array) -> bool:
     """Return whether the measurements (h, w) form an island: under half of the image, hardly any at its edge."""
     seen = _seen(depth_m)
     border = np.concatenate([seen[0], seen[-1], seen[1:-1, 0], seen[1:-1, -1]])
-    return bool(seen.mean() < _MOST and border.mean() < _ON_BORDER)
+    return bool(seen.mean() < MOST and border.mean() < _ON_BORDER)
 
 
 def clean(depth_m: Float32Array, camera: Camera, noise: DepthNoise) -> BoolArray:
     """Return the measured pixels (h, w) without specks and mixed pixels."""
     mixed = mixed_pixels(depth_m, tolerance_m=noise.tolerance_m(depth_m), pixel_m=depth_m / np.float32(camera.fx))
-    return without_specks(_seen(depth_m) & ~mixed, _SPECK_SHARE)
+    return without_specks(_seen(depth_m) & ~mixed)
 
 
 def _seen(depth_m: Float32Array) -> BoolArray:

@@ -12,6 +12,7 @@ from scipy import ndimage
 from modeler.range_noise import range_noise
 from modeler.segmentation.background_colour import BackgroundColour, without_background
 from modeler.segmentation.depth_images import (
+    MOST,
     DepthNoise,
     noise_ratio,
     planning_stride,
@@ -26,12 +27,10 @@ from modeler.sparsity import interpolated
 from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
 
 _RIVAL = 0.4  # ratio of the second-best cluster's score to the best's from which the choice is ambiguous
-_AGREEING_SHARE = 0.5  # share of the static background that must agree for the scene to hold in a frame
 _NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 _RING_PX = (1.5, 2.5)  # distance from a mask at which nothing of the object is left, where it is right to a pixel
-_THIN_SHARE = 0.5  # share of that ring on the object's surface: beyond, most of the rim is missing
 _STEEPEST_SLOPE = np.tan(np.radians(70.0))  # of surfaces that depth cameras measure
 
 _Look = tuple[Frame, Found]
@@ -123,7 +122,7 @@ class Segmenter:
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
             loose = plane is not None and self._share_on(plane, frame, mask) > _LOOSE_SHARE
-            thin = not few and self._share_beyond(plane, frame, mask) > _THIN_SHARE
+            thin = not few and self._share_beyond(plane, frame, mask) > MOST
             outcome = Outcome.UNSURE_MASK if loose or thin else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
@@ -201,7 +200,7 @@ class Segmenter:
             return False
         off = depth - scene.still_m
         agreeing = np.count_nonzero(np.abs(off) < 2.0 * (scene.noise or self.noise).tolerance_m(depth))
-        return bool(agreeing >= _AGREEING_SHARE * np.count_nonzero(np.isfinite(off)))
+        return bool(agreeing >= MOST * np.count_nonzero(np.isfinite(off)))
 
     def _share_on(self, plane: Plane, frame: Frame, mask: BoolArray) -> float:
         """Return the share of a mask's measured pixels that lie on the support plane."""
