@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.priors import HeldPrior
 from modeler.priors import Poke as Push
 from modeler.sequences.input_files import Node, read_text, read_tree
 from modeler.sequences.rendering.recipe import build
@@ -31,7 +32,7 @@ class Turn:
     turn_deg: float
     """Right-handed about up: counter-clockwise from above."""
     name: str = ""
-    cost: float = 1.0
+    cost: float = Candidate.cost
 
     def candidate(self) -> Candidate:
         """Return it."""
@@ -47,7 +48,7 @@ class Poke:
     direction: tuple[float, float, float]
     length_m: float
     name: str = ""
-    cost: float = 1.0
+    cost: float = Candidate.cost
 
     def candidate(self) -> Candidate:
         """Return it."""
@@ -61,7 +62,7 @@ class Lay:
     """Laying the object on its side."""
 
     name: str = ""
-    cost: float = 1.0
+    cost: float = Candidate.cost
 
     def candidate(self) -> Candidate:
         """Return it."""
@@ -76,10 +77,10 @@ class Pose:
     new_from_last: tuple[float, ...]
     """(16,) row by row: from the object's camera coordinates in the last frame to those after the action, in m."""
     name: str = ""
-    cost: float = 1.0
-    sigma_deg: float = 3.0
+    cost: float = Candidate.cost
+    sigma_deg: float = HeldPrior.held_sigma_deg
     """Standard deviation of its rotation, that of a hand that holds the object (`--held-sigma-deg`)."""
-    sigma_m: float = 0.008
+    sigma_m: float = HeldPrior.held_sigma_m
     """Standard deviation of its place."""
 
     def __post_init__(self) -> None:

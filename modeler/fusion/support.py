@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modeler.fusion.depth_views import GREY, DepthViews, ViewBlocks
+from modeler.fusion.depth_views import BATCH, GREY, DepthViews, ViewBlocks
 from modeler.fusion.exposure import Exposure
 from modeler.kernels import tsdf
 from modeler.types import Array
 
 # Strength of the prior on the noise of a single point: the noise of all points counts as much as this many views.
 PRIOR_VIEWS = 3.0  # chosen by hand
-BATCH = 1 << 18  # points per kernel call, which bounds memory
 
 
 @dataclass(frozen=True, eq=False)

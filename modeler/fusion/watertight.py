@@ -19,8 +19,7 @@ from modeler.types import Array, BoolArray
 CELLS = 80**3  # largest number of cells on which unseen space is classified, which bounds time
 ROUNDS = 400  # of the primal-dual iteration
 SPANNING_PASSES = 60  # of Laplacian smoothing of unseen vertices
-SEAM_PASSES = 4  # and of vertices on the seam between seen and unseen surface
-SEAM_RINGS = 4  # rings of vertices next to the seam that are smoothed like weak ones
+SEAM = 4  # passes over the seam between seen and unseen surface, and rings next to it that are smoothed like weak ones
 OUTVOTED = 0.1  # largest share of the views of a cell that may be wrong, for their poses err
 OUTER_LAYERS = 3  # layers of voxels at the border of the grid that are outside
 BELOW_PLANE = 0.01  # largest share of surface points below the plane on which the object stands
@@ -135,8 +134,8 @@ def cleaned(
     vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, ~shown, SPANNING_PASSES)
     # Support is weak along the seam.
     seam = meshing.dilated(shown, triangles, 1) & meshing.dilated(~shown, triangles, 1)
-    vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, seam, SEAM_PASSES)
-    rough = meshing.dilated(seam, triangles, SEAM_RINGS) | (shown & np.append(weak, False)[nearest])
+    vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, seam, SEAM)
+    rough = meshing.dilated(seam, triangles, SEAM) | (shown & np.append(weak, False)[nearest])
     return meshing.taubin_smoothed(vertices_m, triangles, meshing.WEAK_PASSES, rough), triangles, shown
 
 

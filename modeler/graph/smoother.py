@@ -249,7 +249,7 @@ def solve(
     graph: PoseGraph,
     guess: Mapping[int, Array],
     *,
-    outlier_distance: float = 14.2,
+    outlier_distance: float = Smoother.outlier_distance,
     shared: float = 0.0,
     common: float = 0.0,
     axis: CommonAxis | None = None,

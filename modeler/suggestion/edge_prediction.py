@@ -24,7 +24,7 @@ from modeler.registration.visibility.likelihood import (
     PairLikelihood,
     VisibilityLikelihood,
 )
-from modeler.registration.visibility.refinement import visible_share
+from modeler.registration.visibility.refinement import Refiner, visible_share
 from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, InputError, RayImage, Solution
 
@@ -35,7 +35,6 @@ USUAL_SCALE: Final = 1.7
 EVEN_ODDS_DEG, ODDS_DEG = 106.0, 21.0
 """Rotation between views at which half of the registrations fail or are clearly wrong, and over which the odds change
 e-fold: a logistic fit to 475 steps over 48 rendered shapes of the tuning half, 42 of which failed."""
-_PATCHES: Final = 32  # into which the registration divides a surface (`Refiner.halvings`)
 TURNS_RAD: Final = np.radians(3.0) * np.arange(-60, 60)
 """Turns from the true pose about the table's normal, a posterior's width apart, for the likelihood."""
 _TRUE: Final = 60
@@ -189,7 +188,7 @@ class EdgePredictor:
         n of the tempered likelihood (eq. 7), and those of the refinement (eq. 14) with residuals as predicted.
         """
         tempered = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / patches)
-        return tempered + visible_share(patches / _PATCHES) * patches
+        return tempered + visible_share(patches / 2**Refiner.halvings) * patches
 
     def edge(
         self,

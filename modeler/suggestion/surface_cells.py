@@ -19,12 +19,12 @@ from scipy.spatial import KDTree
 from modeler import se3
 from modeler.fusion.depth_views import free_of, window
 from modeler.kernels.occupancy import observation_counts
+from modeler.rays import Sensor
 from modeler.types import Array, BoolArray, Camera, RayImage, Solution
 
 IntArray = npt.NDArray[np.intp]
 CELLS = 40  # across the object: cells of 2 to 3 mm on objects of 10 cm, as wide as the balls that smooth them
 _MARGIN_PX = 1  # around a pixel: silhouettes mix foreground and background
-_MIN_COSINE = 0.35  # between normal and ray, above which surface gives points (`Sensor.min_cosine`)
 _NEIGHBOURS, _REACH = 50, 7.0  # cells by which normals are smoothed, and how far apart at most, in cells
 _THINNED = 2  # every so many cells take part in smoothing, which halves the time
 _RIDGE = 1e-3  # where neighbours lie on a line
@@ -184,7 +184,9 @@ class SurfaceCells:
         covered = ndimage.minimum_filter(near_m, size=2)  # a cell covers up to two of the raster each way
         near_m = np.minimum(near_m, np.where(np.isfinite(covered), covered + self.cell_m, np.inf))
         cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
-        visible = np.flatnonzero((depth_m <= near_m[tuple(place.T)] + 1.5 * self.cell_m) & (cosine >= _MIN_COSINE))
+        visible = np.flatnonzero(
+            (depth_m <= near_m[tuple(place.T)] + 1.5 * self.cell_m) & (cosine >= Sensor.min_cosine)
+        )
         away = self.seen & (cosine < 0.0)
         np.maximum.at(back_m, tuple(place[away].T), depth_m[away])
         back_m = ndimage.maximum_filter(back_m, size=3)
