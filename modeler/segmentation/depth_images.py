@@ -13,19 +13,18 @@ from scipy import ndimage
 from modeler.types import Array, BoolArray, Camera, Float32Array
 
 MOST = 0.5  # the majority of pixels, frames or a rim
+MOSTLY = 0.7  # of the measurements at a static pixel agree; of the frames show the object alone
+LEAST_PIECE = 0.07  # of the largest: noise along edges, and false depth around limbs, have pieces of up to 6 %
 STRAY_WEIGHT = 0.2  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
+HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an image that shows an object alone
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
-_OUTLIERS_IN = 7  # one measurement in this many may lie behind the background by error
+_OUTLIERS_IN = 7  # one measurement in this many may be false; where more lie before the background, something moved
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
-_STILL_SHARE = 0.7  # share of agreeing measurements at a static pixel
-_MOVED_SHARE = 0.15  # share of measurements in front of the background at a pixel that moved
 _QUARTERS_APART = 1.35  # standard deviations from the lower to the upper quartile of a Gaussian
 Labels = npt.NDArray[np.int32]
 _JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
 _GRID_CELLS = 80  # largest number of voxels along a side
 _GRAZING = np.tan(np.radians(85.0))  # surfaces at a more grazing angle are indistinguishable from mixed pixels
-_SEEN_SHARE = 0.4  # share of measurements in a row or column that is not blind
-_BLIND_SHARE = 0.01  # share of measurements in a blind band
 _RAGGED_SHARE = 0.02  # share of the image by which the edge of a blind band may bend after undistortion
 _SPECK_SHARE = 0.003  # share of a mask; smaller pieces are removed
 
@@ -123,11 +122,11 @@ def separate_layers(depths_m: Sequence[Float32Array], camera: Camera, noise: Dep
     enough = 2 if frames > _FEW_FRAMES else 1
     nearer = (stack < back - noise.tolerance_m(back)).sum(axis=0)
     share = (nearer / np.maximum(readings, 1)).astype(np.float32)
-    often = (share >= _MOVED_SHARE) & (nearer >= enough)
+    often = (share >= 1.0 / _OUTLIERS_IN) & (nearer >= enough)
     moved: BoolArray = np.asarray(ndimage.binary_opening(often, np.ones((3, 3))), dtype=np.bool_)
     front = np.where(moved, np.take_along_axis(stack, (nearer // 2)[None], axis=0)[0], back)
     back[agreeing < min(2, frames - 1)] = np.nan
-    still = (agreeing >= np.maximum(enough, _STILL_SHARE * readings)) & ~moved
+    still = (agreeing >= np.maximum(enough, MOSTLY * readings)) & ~moved
     back, front, rays = (point_image(depth, camera, stride=stride) for depth in (back, front, np.ones_like(back)))
     return Layers(back, front, rays, moved, still, share)
 
@@ -227,7 +226,7 @@ def edge_of(seen: BoolArray) -> BoolArray:
 def _outermost(seen: BoolArray) -> BoolArray:
     """Return pixels (h, w) of the first and last row, and of the first and last row with enough measurements."""
     edge = np.zeros_like(seen)
-    rows = np.flatnonzero(seen.mean(axis=1) > _SEEN_SHARE)
+    rows = np.flatnonzero(seen.mean(axis=1) > MOST)
     if len(rows):
         first, last, ragged = int(rows[0]), int(rows[-1]), round(_RAGGED_SHARE * len(seen))
         beyond = np.pad(seen, ((1, 1), (0, 0)))
@@ -241,7 +240,7 @@ def _outermost(seen: BoolArray) -> BoolArray:
 
 def _blind(rows: BoolArray) -> bool:
     """Return whether rows (h, w) hold only isolated measurements; beyond a table's edge an object may still be seen."""
-    return not rows.size or bool(rows.mean() < _BLIND_SHARE)
+    return not rows.size or bool(rows.mean() < HARDLY)
 
 
 def _label(mask: BoolArray, structure: BoolArray | None = None) -> Labels:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.segmentation.depth_images import (
+    LEAST_PIECE,
     STRAY_WEIGHT,
     DepthNoise,
     Labels,
@@ -26,11 +27,9 @@ from modeler.segmentation.scene import Scene
 from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, Plane
 
 Window = tuple[slice, slice]
-_ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
 _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
-_LEAST_PIECE = 0.07  # of the object; false depth filled in around a figure's limbs has pieces of up to 6 %
+_ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
-_CLEARANCE_M = 0.001
 _MOVED_M = 0.02  # of an object's outline between the frames from which its scene is learned
 _CREASE_M = 0.01  # creases of the support are at most so high, and so far from the object
 _LOW_SHARE = 0.3  # share of the object's height, for flat objects
@@ -283,7 +282,7 @@ def _joined(best: int, labels: Labels, in_zone: BoolArray, neighbours: Labels) -
     touching = np.bincount(labels[np.isin(neighbours, own_pieces)], minlength=int(labels.max()) + 1) > 0
     sizes = np.bincount(labels)
     own: BoolArray = touching & _mostly(in_zone, labels)
-    own &= sizes > _LEAST_PIECE * sizes[best]
+    own &= sizes > LEAST_PIECE * sizes[best]
     own[best] = True
     return own
 
@@ -363,7 +362,7 @@ def _foreground(
         rise = points @ scene.plane.normal.astype(np.float32)
         height = rise + np.float32(scene.plane.offset_m)
         slope = np.maximum(np.abs(rise / depth), np.float32(_FLATTEST_SLOPE))
-        fore &= height > tolerance * slope + np.float32(_CLEARANCE_M)
+        fore &= height > tolerance * slope + np.float32(noise.floor_m)
     if scene.scenery_m is not None:
         rows, columns = (np.arange(part.start, part.stop) // thinning for part in window)
         fore &= depth < scene.scenery_m[rows[:, None], columns] - tolerance

@@ -13,7 +13,10 @@ from scipy import ndimage
 from modeler.range_noise import RangeNoise
 from modeler.segmentation.background_colour import BackgroundColour
 from modeler.segmentation.depth_images import (
+    HARDLY,
+    LEAST_PIECE,
     MOST,
+    MOSTLY,
     STRAY_WEIGHT,
     DepthNoise,
     Labels,
@@ -38,15 +41,12 @@ from modeler.segmentation.planes import (
 from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
 
 _CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
-_NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
-_LEAST_REGION = 0.1  # of the largest moving region; noise along the edges of static things has up to 0.06
-_ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere from which the object is ambiguous
-_WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
+_NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
+RIVAL = 0.4  # ratio of the score of what else may be the object from which the choice is ambiguous
+_WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _TOUCHING_PX = 3
-_ON_BORDER = 0.005  # share of measured pixels along the image's edge; with more the scene extends beyond it
 _ON_PLANE, _ABOVE, _BELOW = 0.1, 0.01, 0.2  # shares of the points: at least, at least, and at most for a support plane
-_MOSTLY = 0.7  # share of the frames
 
 
 @final
@@ -142,8 +142,8 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     regions = np.zeros(depth.shape, dtype=np.int32)
     ndimage.label(layers.moved & allowed & near, output=regions)
     merit_of = _central(regions, depth, layers.front_share)
-    large = merit_of > _LEAST_REGION * merit_of.max()
-    return large[regions], bool(elsewhere.sum() < _ELSEWHERE * merit.sum())
+    large = merit_of > LEAST_PIECE * merit_of.max()
+    return large[regions], bool(elsewhere.sum() < RIVAL * merit.sum())
 
 
 def _standing_object(
@@ -242,14 +242,14 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
 def shows_object_alone(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> bool:
     """Return whether depth images (n of (h, w), NaN = no measurement) show an object without background or support."""
     alone = [is_island(depth) and not _supported(depth, camera, noise) for depth in depths_m if _seen(depth).any()]
-    return bool(alone) and sum(alone) >= _MOSTLY * len(alone)
+    return bool(alone) and sum(alone) >= MOSTLY * len(alone)
 
 
 def is_island(depth_m: Float32Array) -> bool:
     """Return whether the measurements (h, w) form an island: under half of the image, hardly any at its edge."""
     seen = _seen(depth_m)
     border = np.concatenate([seen[0], seen[-1], seen[1:-1, 0], seen[1:-1, -1]])
-    return bool(seen.mean() < MOST and border.mean() < _ON_BORDER)
+    return bool(seen.mean() < MOST and border.mean() < HARDLY)
 
 
 def clean(depth_m: Float32Array, camera: Camera, noise: DepthNoise) -> BoolArray:

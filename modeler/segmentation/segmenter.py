@@ -22,11 +22,10 @@ from modeler.segmentation.depth_images import (
 )
 from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, nearest_seen_m
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
-from modeler.segmentation.scene import Scene, clean, is_island, learn, shows_object_alone
+from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
 from modeler.sparsity import interpolated
 from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
 
-_RIVAL = 0.4  # ratio of the second-best cluster's score to the best's from which the choice is ambiguous
 _NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
@@ -96,7 +95,7 @@ class Segmenter:
         boxes = np.array([np.percentile(_points(frame)[look.mask], [0.5, 99.5], axis=0) for frame, look in looks])
         areas, rivals = [look.area_m2 for _, look in looks], [look.rival for _, look in looks]
         zone = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
-        sure = scene.sure and float(np.median(rivals)) < _RIVAL
+        sure = scene.sure and float(np.median(rivals)) < RIVAL
         frames, masks = [frame for frame, _ in looks], [look.mask for _, look in looks]
         return replace(
             scene,
@@ -138,7 +137,7 @@ class Segmenter:
         count = np.count_nonzero(mask)
         if count < self.min_points:
             return Segmentation(mask, scene.plane, Outcome.TOO_FEW_POINTS)
-        sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < _RIVAL and not found.goes_on
+        sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * AREA_FACTOR
         sure &= not is_cut(mask, scene)
