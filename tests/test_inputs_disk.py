@@ -20,7 +20,6 @@ from recordings import small_frames
 from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.sequences import open_sequence, write_bop
-from modeler.viz.stream import ends_whole
 
 
 def with_files_of_at_most(size: int, *arguments: str) -> int:
@@ -63,9 +62,6 @@ def test_a_recording_that_is_cut_off_is_said(scene: Path, tmp_path: Path) -> Non
     size = max(sizes) + 1000  # report.json holds times, whose digits vary
     recording = tmp_path / "run" / "recording.rrd"
     assert recording.stat().st_size > size
-    assert ends_whole(recording)
-    recording.write_bytes(recording.read_bytes()[:-100])
-    assert not ends_whole(recording)
     command = ["build", str(short), "--out", str(tmp_path / "run"), *QUICK, "--overwrite"]
     program = f"import sys, resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size})); import modeler.cli"
     program += "; sys.exit(modeler.cli.main(sys.argv[1:]))"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -13,7 +14,6 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +26,7 @@ from turning_box import COUNT
 
 from modeler.types import Step
 from modeler.viz import entities, viewer
+from modeler.viz.destinations import RecordingFile, Shown
 from modeler.viz.stream import RerunStream, open_stream
 
 
@@ -35,21 +36,21 @@ def test_a_run_that_is_killed_leaves_a_readable_recording(run: list[Step], tmp_p
     stream(run[0])
     stream(run[1])
     stream.recording.flush()
+    time.sleep(0.2)  # until what is in the pipe is copied
     (tmp_path / "cut.rrd").write_bytes((tmp_path / "r.rrd").read_bytes())
     stream.close()
     assert set(read(tmp_path / "cut.rrd")[entities.NOW]) == {0, 1}
 
 
-@pytest.mark.parametrize("watched", [False, True])
-def test_steps_are_written_in_one_piece_unless_somebody_watches(run: list[Step], tmp_path: Path, watched: bool) -> None:
+def test_steps_are_written_in_one_piece_also_where_somebody_watches(run: list[Step], tmp_path: Path) -> None:
     """Rerun keeps metadata of each piece in memory till the file is complete, which thousands of frames exhaust."""
-    stream = open_stream("box", save=tmp_path / "r.rrd", web=watched)
+    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     for step in run[:2]:
         stream(step)
         time.sleep(0.4)  # longer than Rerun waits with what is watched
     stream.close()
     pieces = [chunk.entity_path for chunk in rerun.chunk.RrdReader(tmp_path / "r.rrd").stream()]
-    assert pieces.count(f"/{entities.NOW}") == (2 if watched else 1)
+    assert pieces.count(f"/{entities.NOW}") == 1
 
 
 def listeners(process: subprocess.Popen[bytes]) -> set[str]:
@@ -121,7 +122,7 @@ def test_a_viewer_that_is_already_open_may_be_closed_while_the_run_goes_on(run: 
 def test_a_viewer_that_freezes_does_not_stop_the_run(
     run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("modeler.viz.stream._PATIENCE_S", 0.5)
+    monkeypatch.setattr("modeler.viz.destinations._PATIENCE_S", 0.5)
     monkeypatch.setattr("modeler.viz.viewer._STOP_S", 0.2)
     stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     stream(run[0])
@@ -132,52 +133,89 @@ def test_a_viewer_that_freezes_does_not_stop_the_run(
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
 
 
-@dataclass
-class SlowDisk:
-    """A recording that takes its time to write its file."""
+_STREAM = """\
+import resource, socket, sys
+from modeler.viz import destinations
+from modeler.viz.stream import open_stream
+from turning_box import steps
+from pathlib import Path
 
-    file: Path
+silent = socket.create_server(("127.0.0.1", 0))
+watched = f"rerun+http://127.0.0.1:{silent.getsockname()[1]}/proxy" if sys.argv[3:] else None
+destinations._PATIENCE_S = 0.2
+stream = open_stream("box", save=Path(sys.argv[1]), connect=watched)
+most = int(sys.argv[2]) or resource.RLIM_INFINITY
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+for step in steps(2):
+    stream(step)
+stream.close()
+"""
 
-    def flush(self, timeout_sec: float) -> None:
-        raise RuntimeError("not everything was sent in time")
 
-    def disconnect(self) -> None:
-        for _ in range(10):
-            with self.file.open("ab") as file:
-                file.write(b"more")
-            time.sleep(0.05)
-        self.file.write_bytes(b"whole")
+def streamed(path: Path, *options: str) -> str:
+    """Stream a run to a file in a process of its own, and return what that says."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    arguments = [sys.executable, "-c", _STREAM, str(path), *options]
+    ended = subprocess.run(arguments, stderr=subprocess.PIPE, text=True, timeout=60.0, check=False, env=environment)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stderr
 
 
-@pytest.mark.parametrize("watched", [False, True])
-def test_a_recording_is_waited_for_as_long_as_it_grows(
-    watched: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("short", [0.5, 0.9, 0.99, 0.9999])
+def test_a_disk_that_fills_at_any_piece_does_not_hold_the_process(
+    run: list[Step], tmp_path: Path, short: float
 ) -> None:
-    monkeypatch.setattr(f"modeler.viz.stream.{'_PATIENCE_S' if watched else '_DISK_PATIENCE_S'}", 0.2)
-    recording: Any = SlowDisk(tmp_path / "r.rrd")
-    RerunStream(recording, (), 0.0, recording.file, watched=watched).close()
-    assert recording.file.read_bytes() == b"whole"
+    path = tmp_path / "r.rrd"
+    assert "is truncated" not in streamed(path, "0")
+    most = int(short * path.stat().st_size)
+    assert f"{path}: is truncated (File too large)" in streamed(path, str(most))
+    assert path.stat().st_size == most
 
 
-def test_a_disk_that_hangs_does_not_hold_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("modeler.viz.stream._DISK_PATIENCE_S", 0.2)
-    released = threading.Event()
-    recording: Any = SimpleNamespace(disconnect=released.wait)
-    (tmp_path / "r.rrd").write_bytes(b"half")
-    closing = threading.Thread(target=RerunStream(recording, (), 0.0, tmp_path / "r.rrd").close, daemon=True)
-    closing.start()
-    closing.join(10.0)
-    assert not closing.is_alive()
+def test_a_viewer_that_accepts_and_stays_silent_does_not_hold_the_process(tmp_path: Path) -> None:
+    streamed(tmp_path / "r.rrd", "0", "watched")
+    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0, 1}
+
+
+def test_a_viewer_that_is_far_behind_is_left_out(caplog: pytest.LogCaptureFixture, monkeypatch: Any) -> None:
+    released, unregistered = threading.Event(), threading.Event()
+    monkeypatch.setattr("rerun.unregister_shutdown", unregistered.set)
+    monkeypatch.setattr("modeler.viz.destinations._STOP_S", 0.2)
+    recording: Any = SimpleNamespace(disconnect=lambda: None)
+    shown, begun = Shown(recording), threading.Event()
+    shown.put(lambda _: (begun.set(), released.wait()))
+    assert begun.wait(10.0)
+    for _ in range(200):
+        shown.put(lambda _: None)
+    assert caplog.text.count("takes no data any more") == 1
+    shown.close(lambda: None)
+    assert unregistered.is_set()
     released.set()
 
 
-def test_a_disk_that_fills_before_the_recording_begins_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise RuntimeError("Failed to encode LogMsg: Failed to write: No space left on device (os error 28)")
+def test_a_disk_that_hangs_does_not_hold_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    unregistered, released = threading.Event(), threading.Event()
+    monkeypatch.setattr("rerun.unregister_shutdown", unregistered.set)
+    monkeypatch.setattr("modeler.viz.destinations._DISK_PATIENCE_S", 0.2)
+    recording: Any = SimpleNamespace(disconnect=released.wait, set_sinks=lambda sink: None)
+    file = RecordingFile(tmp_path / "r.rrd")
+    file.attach(recording)
+    file.close(recording)
+    assert unregistered.is_set()
+    assert "r.rrd: is truncated (the disk does not answer)" in caplog.text
+    released.set()
 
-    monkeypatch.setattr("rerun.RecordingStream.set_sinks", full)
-    with pytest.raises(viewer.InputError, match=r"r\.rrd: cannot write the recording .*No space left on device"):
-        open_stream("box", save=tmp_path / "r.rrd")
+
+def test_a_disk_that_fills_before_the_recording_begins_is_said(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(viewer.InputError, match=r"r\.rrd: cannot write the recording .*File too large"):
+            open_stream("box", save=tmp_path / "r.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def closed_port() -> int:

@@ -81,7 +81,7 @@ class Build:
         from modeler.cli.outputs import check_run_folder
         from modeler.concurrency import in_parallel
         from modeler.export import PairCache, RunFolder, RunMeta, alone
-        from modeler.viz.stream import ends_whole, load
+        from modeler.viz.stream import load
 
         began_s = time.perf_counter()
         _check(self)
@@ -116,9 +116,6 @@ class Build:
                 say(remark)
             report = _run(self, modeler, (frames, scene), folder, meta, began_s=began_s)
             folder.finish()
-        recording = folder.path / "recording.rrd"
-        if not ends_whole(recording):
-            say(f"{recording}: is truncated (is the disk full?); all other files are complete")
         return _summarise(report, self, modeler.prior)
 
     def settings(self) -> dict[str, object]:

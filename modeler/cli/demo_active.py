@@ -126,11 +126,10 @@ class _Demo:
             self.folder.write(step, self.meta)
             self.stream(step)
             if count == 0 and step.view is not None:
-                self.stream.recording.send_blueprint(next_view.layout(step.view))
+                self.stream.lay_out(next_view.layout(step.view))
             belief = run.modeler.belief(step.views, step.solution, step.edges_so_far)
             found = suggest(belief, None, self.goal)
-            for path, drawing in next_view.draw_next(belief, found, done):
-                self.stream.recording.log(path, drawing)
+            self.stream.draw(step, next_view.draw_next(belief, found, done))
             _say(found, done, step)
             best, reached = _best(found), found.reached
             if reached or best is None or count == actions:
