@@ -1,5 +1,6 @@
 """Run the command line: as `python -m modeler`, and as the console script `modeler`."""
 
+import os
 import signal
 import sys
 
@@ -17,4 +18,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    if not sys.flags.safe_path and sys.path[0] != os.path.dirname(os.path.dirname(__file__)):
+        del sys.path[0]  # the current folder, whose Python files are no modules of ours
     sys.exit(main())

@@ -334,7 +334,7 @@ def test_what_was_compiled_ahead_is_all_that_a_run_needs(tmp_path: Path) -> None
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
 
     def kept() -> dict[Path, int]:
-        return {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb[ci]")}
+        return {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("kernels-*/*")}
 
     ahead = "from modeler.cli.compiling import compile_kernels; compile_kernels()"
     done = subprocess.run([sys.executable, "-c", ahead], env=environment, capture_output=True, text=True, check=True)

@@ -1,6 +1,5 @@
 """Every kernel of the registration against its readable twin, on random inputs."""
 
-import os
 from pathlib import Path
 
 import naive
@@ -10,7 +9,17 @@ from scipy.stats import multivariate_normal
 
 from modeler import kernels, se3
 from modeler.cli import compiling
-from modeler.kernels import gauss_newton, mixture, paper, photometric, planes, point_likelihood, point_to_plane, scores
+from modeler.kernels import (
+    cache,
+    gauss_newton,
+    mixture,
+    paper,
+    photometric,
+    planes,
+    point_likelihood,
+    point_to_plane,
+    scores,
+)
 from modeler.kernels.point_likelihood import Projection
 from modeler.registration.visibility.sampling import GaussianMixture
 from modeler.se3 import matrices, rows
@@ -258,25 +267,6 @@ def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):
     np.testing.assert_allclose(planes.silhouette_distance(mask, 3.0), np.minimum(got, 3.0), atol=1e-4)
 
 
-def test_compiled_kernels_of_other_sources_are_dropped(tmp_path):
-    """A kernel contains copies of functions from other files, which may have changed, whatever their dates."""
-    (tmp_path / "a.py").write_text("one")
-    compiled = tmp_path / "__pycache__" / "b.nbi"
-
-    def is_kept() -> bool:
-        kernels.drop_stale(tmp_path)
-        return compiled.exists()
-
-    kernels.drop_stale(tmp_path)
-    compiled.touch()
-    assert is_kept()
-    (tmp_path / "a.py").write_text("two")
-    os.utime(tmp_path / "a.py", (10, 10))  # as copied from where it was written long ago
-    assert not is_kept()
-    compiled.touch()
-    assert is_kept()
-
-
 @pytest.mark.parametrize("sigma_rad", [0.01, 0.5, 3.0])
 def test_densities_of_a_mixture_leave_out_nothing_that_counts(rng, sigma_rad):
     """However far apart the Gaussians lie, and where no pose is near any of them."""
@@ -319,11 +309,11 @@ def test_patches_come_from_recursive_bisection(rng, count):
 
 def test_kernels_know_that_they_are_compiled():
     point_likelihood.classify(rows(np.eye(4)[None])[0], random_projection(np.random.default_rng(0)), parameters())
-    assert kernels.compiled("point_likelihood", "classify")
+    assert cache.kept("point_likelihood", "classify")
 
 
 def test_the_count_of_kernels_compiled_ahead_is_that_of_all_that_a_run_uses() -> None:
     folder = Path(kernels.__file__).parent
-    compiled = {path.stem for path in folder.glob("*.py") if "njit(" in path.read_text()}
+    compiled = {path.stem for path in folder.glob("*.py") if "@njit(" in path.read_text()}
     elsewhere = {"occupancy", "paper"}  # of other commands and methods
     assert sorted((*compiling._USED, *compiling._USED_TO_FUSE)) == sorted(compiled - elsewhere)

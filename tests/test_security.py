@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import ast
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from commanded import QUICK
+from commanded import BOX, QUICK
 from recordings import small_frames, small_truth, write_open3d
 from sources import SOURCES, nodes
 
+import modeler
 from modeler.cli import main
 from modeler.sequences import open_sequence, write_bop
 
 EVIL = "../../../../evil <script>alert(1)</script>"
 RUNS_CODE = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "torch", "yaml", "runpy", "code"}
+OURS = {"cache": {"pickle"}}  # compiled code of ours, in files that nobody else can write
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
 def test_nothing_is_unpickled_and_no_text_is_run(path: Path) -> None:
     for node in nodes(path):
         if isinstance(node, ast.Import):
-            assert not {alias.name.split(".")[0] for alias in node.names} & RUNS_CODE
+            assert not {alias.name.split(".")[0] for alias in node.names} & (RUNS_CODE - OURS.get(path.stem, set()))
         if isinstance(node, ast.ImportFrom):
             assert (node.module or "").split(".")[0] not in RUNS_CODE
         if not isinstance(node, ast.Call):
@@ -58,6 +63,48 @@ def test_outputs_stay_where_they_are_told_to_be(tmp_path: Path, capsys: pytest.C
     assert "<script>alert" not in (out / "page.html").read_text()
     assert everything(tmp_path, out) == before
     assert open_sequence(out / "bop").name == EVIL
+
+
+@pytest.mark.parametrize("command", ["report", "batch", "register"])
+def test_python_files_in_the_current_folder_are_not_run(scene: Path, built: Path, tmp_path: Path, command: str) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    for name in ("numpy", "json", "pyarrow", "submitit", "rerun", "numba", "modeler"):
+        (here / f"{name}.py").write_text(f"open({str(tmp_path / 'run')!r}, 'w').close(); raise SystemExit('it is run')")
+    arguments = {
+        "report": ["report", built, "--out", tmp_path / "page.html"],
+        "batch": ["batch", scene, "--out", tmp_path / "many", *QUICK, "--workers", "1", "--frames", ":2"],
+        "register": ["register", scene, "0", "1", *QUICK],
+    }[command]
+    program = f"import sys; sys.path.insert(0, {str(Path(modeler.__file__).parent.parent)!r}); "
+    program += "from modeler.__main__ import main; sys.exit(main())"
+    ended = subprocess.run(
+        [sys.executable, "-P", "-c", program, *map(str, arguments)],  # as the console script does
+        cwd=here,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        capture_output=True,
+        text=True,
+        timeout=200.0,
+        check=False,
+    )
+    assert ended.returncode in (0, 3), ended.stderr
+    assert not (tmp_path / "run").exists()
+    if command == "report":
+        assert "There are no pictures" not in (tmp_path / "page.html").read_text()
+
+
+def test_python_files_in_the_current_folder_are_not_run_by_the_module(tmp_path: Path) -> None:
+    (tmp_path / "numpy.py").write_text("raise SystemExit('it is run')")
+    ended = subprocess.run(
+        [sys.executable, "-m", "modeler", "info", BOX],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(modeler.__file__).parent.parent)},
+        capture_output=True,
+        text=True,
+        timeout=100.0,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_links_in_a_run_folder_are_replaced_and_not_followed(tmp_path: Path) -> None:

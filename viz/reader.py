@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import subprocess
 import sys
 import warnings
@@ -17,6 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from PIL import Image
 
+from modeler.processes import environment
 from modeler.viz import entities
 
 FRAME_PATHS: Final = (
@@ -50,7 +50,7 @@ def steps_of(recording: Path) -> dict[int, LoggedStep]:
     """
     read = subprocess.run(
         [sys.executable, *_READER, str(recording)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        env=environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

@@ -232,7 +232,7 @@ def _run(
             Console(len(frames), stream.address, modeler.prior) as console,
             advising(run.modeler, console.advise, stream.advise) as advise,
         ):
-            followed = frames.live and (console.watched or stream.watched)
+            followed = frames.live and (console.watched or stream.shown is not None)
             wanted = frames.until(lambda: interrupt.asked)
             coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
             for event in _events(run, coming, interrupt, live=frames.live):

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from modeler.cli.console import say
+from modeler.processes import environment
 
 if TYPE_CHECKING:
     from modeler.pipeline import Modeler
@@ -30,28 +31,37 @@ _USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
 
 
 def compile_kernels() -> None:
-    """Compile missing kernels with a progress message; they are cached for later commands.
+    """Compile missing kernels with a progress message; they are kept for later commands, if they can be.
 
     Does nothing if they are compiled. Failures here are ignored: kernels are then compiled, or reported, at first use.
     """
     from modeler import kernels
+    from modeler.kernels import cache
 
-    missing = [name for name, job in _JOBS.items() if not kernels.compiled(*job.last)]
+    missing = [name for name, job in _JOBS.items() if not cache.kept(*job.last)]
     if not missing:
         return
     begun: set[str] = set()
     lock = threading.Lock()
+    total = len(_USED) + (len(_USED_TO_FUSE) if "fusion" in missing else 0)
+
+    def note(module: str, often: str = "once on this machine") -> None:
+        with lock:
+            if module not in begun:
+                begun.add(module)
+                say(f"compiling kernels, {often}: {len(begun)} of {total}")
+
+    if not cache.writable():
+        say(f"compiled kernels cannot be kept in {cache.folder()}; make room there, or set NUMBA_CACHE_DIR")
+        kernels.on_compiling(lambda module: note(module, "for this command alone"))
+        return
 
     def follow(process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         with process.stdout as lines:
             for line in lines:
-                with lock:
-                    if line.strip() not in begun:
-                        begun.add(line.strip())
-                        say(f"compiling kernels, once on this machine: {len(begun)} of {total}")
+                note(line.strip())
 
-    total = len(_USED) + (len(_USED_TO_FUSE) if "fusion" in missing else 0)
     processes = [
         subprocess.Popen(
             [sys.executable, "-c", f"from modeler.cli.compiling import work; work({job!r})"],
@@ -59,6 +69,7 @@ def compile_kernels() -> None:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
+            env=environment(),
         )
         for job in missing
     ]

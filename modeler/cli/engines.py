@@ -16,6 +16,7 @@ from threading import Lock
 from typing import Any, TypeVar, final
 
 from modeler.concurrency import cores
+from modeler.processes import environment
 from modeler.types import InputError
 
 T = TypeVar("T")
@@ -118,6 +119,7 @@ def _dask(address: str) -> Iterator[Executor]:
 
 def _slurm(folder: Path) -> Any:
     """Return submitit's executor, for Slurm where that is there, else for this machine."""
+    os.environ.update(environment())  # that of the jobs
     executor = importlib.import_module("submitit").AutoExecutor(
         folder=folder, cluster="slurm" if _has_slurm() else "local"
     )

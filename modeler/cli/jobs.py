@@ -20,6 +20,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
+from modeler.processes import environment
+
 BUILDER = "modeler.cli.one_job"
 """Module that builds the sequence of a job, in a process of its own."""
 NOTES = ".batch"
@@ -272,4 +274,4 @@ def last_line(log: Path, status: int) -> str:
 def _environment(threads: int) -> dict[str, str]:
     """Return the environment of a process that builds, with as many threads as it may have."""
     counts = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), str(threads))
-    return {**os.environ, **counts}
+    return environment() | counts

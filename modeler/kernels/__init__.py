@@ -1,10 +1,7 @@
 """Compiled functions: arrays in, arrays out; no package types, no hidden randomness."""
 
-import hashlib
 import os
 from collections.abc import Callable
-from contextlib import suppress
-from importlib import import_module
 from pathlib import Path
 
 from numba.core import config, event
@@ -13,33 +10,6 @@ from numba.core import config, event
 config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportAttributeAccessIssue]
 # Threads of Open3D that spin at the end of each short loop delay each other on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-
-def drop_stale(folder: Path) -> None:
-    """Delete the compiled kernels of a folder if its source files are not those that they were compiled from.
-
-    Numba keeps a kernel while its own file is unchanged, although it contains functions inlined from other files. Dates
-    do not tell: a file copied with its date may be older than the kernels that it changes.
-    """
-    digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    compiled_from = folder / "__pycache__" / "kernels.sha256"
-    with suppress(OSError):
-        if compiled_from.read_text() == digest.hexdigest():
-            return
-    for index in compiled_from.parent.glob("*.nbi"):
-        with suppress(OSError):  # another process was faster, or no permission
-            index.unlink()
-    with suppress(OSError):
-        compiled_from.parent.mkdir(exist_ok=True)
-        compiled_from.write_text(digest.hexdigest())
-
-
-def compiled(module: str, name: str) -> bool:
-    """Return whether the current version of a kernel has been compiled on this machine."""
-    kernel = getattr(import_module(f"modeler.kernels.{module}"), name)
-    return any(Path(str(kernel.stats.cache_path)).glob(f"{module}.{name}-*.nbi"))
 
 
 def on_compiling(report: Callable[[str], None]) -> None:
@@ -56,6 +26,3 @@ def on_compiling(report: Callable[[str], None]) -> None:
             """Do nothing."""
 
     event.register("numba:compile", Reporter())
-
-
-drop_stale(Path(__file__).parent)

@@ -2,9 +2,9 @@
 
 import math
 
-import numba
 import numpy as np
 
+from modeler.kernels.cache import njit
 from modeler.kernels.point_likelihood import HALF, ONE, VECTOR_MATHS, ZERO
 
 _MIN_FRACTION = np.float32(1e-3)  # of a mean that is surface
@@ -13,7 +13,7 @@ _LIMIT = 3.0  # standard deviations, beyond which are 0.3 % of normal features
 _ROUNDS, _TOLERANCE = 10, 1e-3  # of the fixed-point iteration between variance and limit
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def look_up(colour, pixels, low, table, places, logs):
     """Write the pixels of surface points in a cropped image, and the logarithms of their colours.
 
@@ -32,7 +32,7 @@ def look_up(colour, pixels, low, table, places, logs):
         logs[j] = table[seen[0]] + table[seen[1]] + table[seen[2]]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def lay_out(places, colours, shading, images):
     """Write values at points into images (3, h, w), 0 elsewhere: colours (n,), shading (n,), and 1."""
     for j in range(places.shape[0]):
@@ -40,7 +40,7 @@ def lay_out(places, colours, shading, images):
         images[0, row, column], images[1, row, column], images[2, row, column] = colours[j], shading[j], ONE
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def blur(images, weights, blurred):
     """Write images blurred along both axes, with zeros beyond their borders.
 
@@ -79,7 +79,7 @@ def blur(images, weights, blurred):
                         total[x] += weight * near[x]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def subtract_means(inner, outer, surface, band):
     """Write a band: Gaussian means over surface minus wider ones; 0 outside the surface.
 
@@ -98,7 +98,7 @@ def subtract_means(inner, outer, surface, band):
                 band[k, y, x] = difference if surface[y, x] > ZERO else ZERO
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def subtract_shading(colours, shading, surface, floor, limit, valid):
     """Subtract the best-fitting multiple of the shading from colours, in place; set them to 0 where shading is large.
 
@@ -123,7 +123,7 @@ def subtract_shading(colours, shading, surface, floor, limit, valid):
             colours[y, x] = colours[y, x] - share * shading[y, x] if valid[y, x] else ZERO
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def sample_layer(layer, inside, places, halvings, found):
     """Write the features of surface points in one band, interpolated linearly from the nearest cell of its image.
 
@@ -150,7 +150,7 @@ def sample_layer(layer, inside, places, halvings, found):
         found[1, j], found[2, j] = by_column, by_row
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS)
 def winsorise(features):
     """Scale features to unit variance, and limit them to ±3 standard deviations.
 

@@ -3,10 +3,10 @@
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from modeler.kernels.cache import njit
 from modeler.kernels.lie_group import difference, retract
 from modeler.kernels.photometric import CELL_SIZE, fetch_colours, linearise_features
 from modeler.kernels.point_likelihood import (
@@ -66,7 +66,7 @@ def descend(poses, surfaces, colours, weight, centre, surface_m, regulariser, st
     return over_rows(_iterate, poses, surfaces, colours, weight, centre, surface_m, regulariser, steps)[0]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _iterate(poses, surfaces, colours, weight, centre, surface_m, regulariser, steps):
     """Return poses (m, 12) after some steps, possibly none, and the `equations` last evaluated."""
     moved, gradients, matrices = poses.copy(), np.empty((poses.shape[0], 2, 6)), np.empty((poses.shape[0], 2, 6, 6))
@@ -83,7 +83,7 @@ def _iterate(poses, surfaces, colours, weight, centre, surface_m, regulariser, s
     return moved, gradients, matrices
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def new_workspace(surfaces):
     """Return the buffers of `equations`."""
     count = max(surfaces[0].points.shape[1], surfaces[1].points.shape[1])
@@ -92,7 +92,7 @@ def new_workspace(surfaces):
     return buffers(count), cells, rows, (*small, np.empty(6))
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gradient, matrix):
     """Write the normal equations of matches, for ξ of a pose about the centre (method.md, eq. 10 and 20).
 
@@ -156,7 +156,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
                 matrix[kind, k, m] += turned_block[k, m]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def accumulate(rows, count, gradient, matrix):
     """Write the gradient (6,), -Σ w a r, and the matrix (6, 6), Σ w a aᵀ, of the first equations in `rows` (9, n)."""
     for u in range(6):
@@ -172,7 +172,7 @@ def accumulate(rows, count, gradient, matrix):
             matrix[u, v] = matrix[v, u] = np.float64(total)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def add_pattern_gradient(surface, transformed, about, rows, gradient):
     """Add the fixed pattern's part to the gradient (6,) by ζ about a point (3,) (method.md, eq. 27).
 
@@ -204,7 +204,7 @@ def add_pattern_gradient(surface, transformed, about, rows, gradient):
         gradient[5] += gz
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def rotate_to_source(pose, part, block, rotated, gradient, matrix):
     """Write Rᵀ g and Rᵀ M R, by halves and blocks of three, of a gradient (6,) and a symmetric matrix (6, 6)."""
     for half in range(0, 6, 3):
@@ -220,7 +220,7 @@ def rotate_to_source(pose, part, block, rotated, gradient, matrix):
                 matrix[m, half + k] = a * rotated[m, half] + b * rotated[m, half + 1] + c * rotated[m, half + 2]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def regularised_step(pose, regulariser, centre, gradient, matrix, buffer, step):
     """Write the Gauss-Newton step (6,) of a pose (12,) from its `equations`; `buffer` (6, 6) is overwritten."""
     away = difference(regulariser.mean, pose, centre)
@@ -237,7 +237,7 @@ def regularised_step(pose, regulariser, centre, gradient, matrix, buffer, step):
             step[k] *= regulariser.max_step_rad / angle
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def solve_positive_definite(matrix, vector):
     """Solve a positive definite system (6, 6) in place, by Cholesky factors; overwrites the matrix."""
     for k in range(6):

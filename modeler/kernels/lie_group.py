@@ -5,11 +5,12 @@ Poses are rows of twelve numbers, the upper three rows of their matrices, or who
 
 import math
 
-import numba
 import numpy as np
 
+from modeler.kernels.cache import njit
 
-@numba.njit(cache=True, inline="always")
+
+@njit(cache=True, inline="always")
 def cross(ax, ay, az, bx, by, bz):
     """Return the cross product of two vectors."""
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -22,7 +23,7 @@ _ASIN_1, _ASIN_2, _ASIN_3, _ASIN_4 = 1.0 / 6.0, 3.0 / 40.0, 5.0 / 112.0, 35.0 / 
 _ASIN_5, _ASIN_6, _ASIN_7 = 63.0 / 2816.0, 231.0 / 13312.0, 143.0 / 10240.0
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def quaternion(r00, r01, r02, r10, r11, r12, r20, r21, r22):
     """Return x, y, z and the real part of a rotation matrix's quaternion (Shepperd 1978), and a / sin(a / 2).
 
@@ -56,7 +57,7 @@ def quaternion(r00, r01, r02, r10, r11, r12, r20, r21, r22):
     return x, y, z, real, 2.0 * math.atan2(length, real) / length
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def logarithm(r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz):
     """Return ξ (6 numbers: rad, m) of a motion given by its upper three rows, and a / sin(a / 2).
 
@@ -71,7 +72,7 @@ def logarithm(r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz):
     return wx, wy, wz, tx - 0.5 * ax + last * bx, ty - 0.5 * ay + last * by, tz - 0.5 * az + last * bz, scale
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def exponential(wx, wy, wz, ux, uy, uz, r):
     """Write the rotation (3, 3) of ξ into `r` and return its translation."""
     square = wx * wx + wy * wy + wz * wz
@@ -95,7 +96,7 @@ def exponential(wx, wy, wz, ux, uy, uz, r):
     return ux + second * ax + third * bx, uy + second * ay + third * by, uz + second * az + third * bz
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def difference(first, second, centre):
     """Return ξ = log(C⁻¹ first⁻¹ second C) for poses (12,), C the shift to `centre` (3,), as `logarithm` does.
 
@@ -143,7 +144,7 @@ def difference(first, second, centre):
     )
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def differences(first, second, centre):
     """Return the `difference` (n, 6) of pairs of poses (n, 12)."""
     xi = np.empty((len(first), 6))
@@ -154,7 +155,7 @@ def differences(first, second, centre):
     return xi
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def retract(pose, xi, centre, r, moved):
     """Write pose · C · exp(ξ) · C⁻¹ into `moved` (12,), C the shift to `centre` (3,); `r` (3, 3) is a buffer."""
     x, y, z = exponential(xi[0], xi[1], xi[2], xi[3], xi[4], xi[5], r)
@@ -168,7 +169,7 @@ def retract(pose, xi, centre, r, moved):
         moved[k + 3] = a * x + b * y + c * z + pose[k + 3]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def retract_all(poses, xi, centre):
     """Return pose · C · exp(ξ) · C⁻¹ (n, 4, 4) of poses (n, 4, 4) and tangents ξ (n, 6); see `retract`."""
     moved, row, full, r = np.zeros((len(poses), 4, 4)), np.empty(12), np.empty(12), np.empty((3, 3))
@@ -182,7 +183,7 @@ def retract_all(poses, xi, centre):
     return moved
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def exponentials(xi):
     """Return the motions (n, 4, 4) of tangents (n, 6)."""
     poses = np.zeros((len(xi), 4, 4))
@@ -193,7 +194,7 @@ def exponentials(xi):
     return poses
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def logarithms(poses):
     """Return the tangents (n, 6) of motions (n, 4, 4)."""
     xi = np.empty((len(poses), 6))
@@ -207,7 +208,7 @@ def logarithms(poses):
     return xi
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def mean(poses, weights, start, about, iterations, tolerance):
     """Return the intrinsic mean (12,) of weighted poses, and the covariance (6, 6) of ξ = log(C⁻¹ mean⁻¹ pose C).
 

@@ -9,7 +9,8 @@ other axes in ascending order.
 """
 
 import numpy as np
-from numba import njit
+
+from modeler.kernels.cache import njit
 
 
 def _edge(first: int, second: int) -> int:

@@ -2,9 +2,9 @@
 
 import math
 
-import numba
 import numpy as np
 
+from modeler.kernels.cache import njit
 from modeler.kernels.lie_group import difference
 from modeler.kernels.threads import over_rows
 
@@ -30,7 +30,7 @@ def log_densities(poses, means, roots, widths, log_weights, centre):
     return over_rows(_log_densities, poses, means, roots, widths, log_weights, centre, least=least)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _log_densities(poses, means, roots, widths, log_weights, centre):
     count = len(means)
     log_tops, bounds, places = np.empty(count), np.empty(count), np.empty((count, 3))
@@ -63,7 +63,7 @@ def _log_densities(poses, means, roots, widths, log_weights, centre):
     return result
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def image_of_point(pose, point):
     """Return the image of a point (3,) under a pose (12,)."""
     return (
@@ -73,7 +73,7 @@ def image_of_point(pose, point):
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def trace_between(a, b):
     """Return the trace of the rotation between two poses (12,)."""
     return (
@@ -83,7 +83,7 @@ def trace_between(a, b):
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def log_density(mean, pose, root, log_top, centre):
     """Return the log density of ξ at a pose (12,), and the factor to one with respect to the uniform measure."""
     w0, w1, w2, u0, u1, u2, scale = difference(mean, pose, centre)
@@ -97,7 +97,7 @@ def log_density(mean, pose, root, log_top, centre):
     return log_top - 0.5 * square, (0.5 * scale) ** 4
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def mahalanobis_distances(means, roots, centre):
     """Return the distances (k, k) between means, row i in standard deviations of the i-th Gaussian.
 
@@ -122,7 +122,7 @@ def mahalanobis_distances(means, roots, centre):
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def separate_two(white, weights, members, steps, least, floor):
     """Divide weighted points between two Gaussians by expectation maximisation.
 

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from modeler.kernels.cache import njit
 from modeler.kernels.threads import over_rows
 from modeler.kernels.tsdf import project
 

@@ -6,9 +6,9 @@ rejects most poses with a vanishing likelihood.
 
 import math
 
-import numba
 import numpy as np
 
+from modeler.kernels.cache import njit
 from modeler.kernels.threads import over_rows
 
 NEVER = -np.inf
@@ -24,7 +24,7 @@ X, Y, Z, MARGIN, BACKWARD = range(5)
 """Columns of a check: a surface point (3), its largest distance in front in m, and whether it is the target's."""
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def ray_jacobian(point):
     """Return Q = ∂(w, h, r)/∂(x, y, z) (3, 3) at a point (3,) (paper, appendix)."""
     x, y, z = point
@@ -36,7 +36,7 @@ def ray_jacobian(point):
     return jacobian
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def ray_jacobian_inverse(point):
     """Return Q⁻¹ = ∂(x, y, z)/∂(w, h, r) (3, 3) at a point (3,)."""
     x, y, z = point
@@ -51,7 +51,7 @@ def ray_jacobian_inverse(point):
     return jacobian
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def inverse_3(matrix):
     """Return the inverse (3, 3) of a symmetric positive definite matrix and its determinant."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
@@ -64,7 +64,7 @@ def inverse_3(matrix):
     return result / determinant, determinant
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def spread(first, second, third, noise):
     """Return J L Jᵀ + L with J = first · second · third, all (3, 3); loops are faster than library calls."""
     half, jacobian = np.zeros((3, 3)), np.zeros((3, 3))
@@ -89,7 +89,7 @@ def spread(first, second, third, noise):
     return result
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def point_coefficients(point_b, point_in_a, rotation, noise):
     """Return D (3 numbers: ww, wh, hh), v (3) and K2 of one point (paper, appendix).
 
@@ -115,7 +115,7 @@ def point_coefficients(point_b, point_in_a, rotation, noise):
     )
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def point_density(point_b, pose, ranges_m, intrinsics, noise, reach_sigmas):
     """Return p(b_j | M_A, T) of one point, up to a constant (paper, eq. pbd).
 
@@ -183,7 +183,7 @@ def log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
     return over_rows(_log_likelihoods, poses, points_b, ranges_m, intrinsics, noise, options)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
     result = np.empty(poses.shape[0])
     # In units of K2 for an unrotated point, so that the threshold is a number of pixels, not of 1/m.
@@ -200,7 +200,7 @@ def _log_likelihoods(poses, points_b, ranges_m, intrinsics, noise, options):
     return result
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def mixed(counter):
     """Return 64 random bits of a counter (Steele, Lea and Flood 2014, SplitMix64)."""
     bits = (counter ^ (counter >> SHIFT_30)) * FIRST_FACTOR
@@ -208,7 +208,7 @@ def mixed(counter):
     return bits ^ (bits >> SHIFT_31)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def in_ball(counter):
     """Return the advanced counter and a point (3 numbers) uniform in the unit ball, on a grid of 10⁻⁶."""
     while True:
@@ -221,7 +221,7 @@ def in_ball(counter):
             return counter, x, y, z
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def draw(number, seed, limits, pose):
     """Write the pose of a number: uniform over rotations up to a limit and over a ball of centroid offsets.
 
@@ -264,7 +264,7 @@ def draw(number, seed, limits, pose):
         )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def forbidden(check, pose, near_m, image):
     """Return whether a check's point, transformed by a pose, lies in front of every measured pixel within its reach.
 
@@ -298,7 +298,7 @@ def forbidden(check, pose, near_m, image):
     return free_m > 0.0 and square < free_m * free_m
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def passes(pose, checks, near_m, images):
     """Return whether no check forbids a pose."""
     for j in range(checks.shape[0]):
@@ -322,7 +322,7 @@ def passing(poses, checks, near_m, images):
     return over_rows(_passing, poses, checks, near_m, images)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _passing(poses, checks, near_m, images):
     result = np.empty(poses.shape[0], dtype=np.bool_)
     for i in range(poses.shape[0]):
@@ -335,7 +335,7 @@ def drawn(numbers, seed, limits):
     return over_rows(_drawn, numbers, seed, limits)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _drawn(numbers, seed, limits):
     poses = np.empty((numbers.shape[0], 12))
     for i in range(numbers.shape[0]):
@@ -343,7 +343,7 @@ def _drawn(numbers, seed, limits):
     return poses
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def verdicts(poses, checks, near_m, images):
     """Return whether each check forbids each pose, (m, n); arguments as for `passing`."""
     result = np.empty((poses.shape[0], checks.shape[0]), dtype=np.bool_)
@@ -367,7 +367,7 @@ def nearest_ranges(ranges_m, reach_px):
     return over_rows(_nearest_ranges, np.arange(ranges_m.shape[0] + 2 * down), ranges_m, reach_px, across, down)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _nearest_ranges(rows, ranges_m, reach_px, across, down):
     height, width = ranges_m.shape
     result = np.full((rows.shape[0], width + 2 * across), np.float32(np.inf))

@@ -3,10 +3,10 @@
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from modeler.kernels.cache import njit
 from modeler.kernels.point_likelihood import FACING, ONE, VECTOR_MATHS, ZERO, X, Y, Z, plane_distance
 from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER, OWN, POSITION, RESIDUAL, WEIGHT, match_weight
 
@@ -41,7 +41,7 @@ NO_COLOURS = Colours(
 """Placeholder for colours that are not compared."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def find_in_place(points_m, shift_m, camera, numbers, none, found, offsets):
     """Find where points fall in another view if they are only shifted.
 
@@ -67,7 +67,7 @@ def find_in_place(points_m, shift_m, camera, numbers, none, found, offsets):
             offsets[j, 0], offsets[j, 1] = column - nearest_column, row - nearest_row
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True)
 def in_place(others, numbers, offsets, j):
     """Return another view's feature at the place of a point, and its derivatives; 0 if it has no surface there."""
     k = numbers[j]
@@ -77,7 +77,7 @@ def in_place(others, numbers, offsets, j):
     return others[0, k] + by_column * offsets[j, 0] + by_row * offsets[j, 1], by_column, by_row
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def compare_in_place(features, others, numbers, offsets):
     """Return sums over the points at whose place the other view has surface.
 
@@ -109,7 +109,7 @@ def compare_in_place(features, others, numbers, offsets):
     return moments, matrix, gradient
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def remove_static(features, others, numbers, offsets, share, points_m, focal, values, cells):
     """Write features regressed on those of another view at the same places, and their cells (method.md, eq. 18).
 
@@ -147,7 +147,7 @@ def remove_static(features, others, numbers, offsets, share, points_m, focal, va
     cells[count] = ZERO
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def compare_matches(matches, rotation, values, own_cells, cells, camera, numbers, weight):
     """Return the equations of features of matches (n, 15), in the layout of `point_to_plane.matches`.
 
@@ -190,7 +190,7 @@ def compare_matches(matches, rotation, values, own_cells, cells, camera, numbers
     return found
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fetch_colours(count, pixels, colours, looked_up):
     """Copy cells at the first `pixels` (n,) into columns of `looked_up` (4, n)."""
     for j in range(count):
@@ -199,7 +199,7 @@ def fetch_colours(count, pixels, colours, looked_up):
             looked_up[k, j] = colours.cells[cell, k]
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True)
 def fetch_features(count, pixels, colours, transformed, seen):
     """Write the features `seen` (n,) of the other view where the first transformed points fall, at `pixels` (n,)."""
     for j in range(count):
@@ -212,7 +212,7 @@ def fetch_features(count, pixels, colours, transformed, seen):
         )
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def sum_moments(points, values, transformed, looked_up, seen, surface_m2):
     """Return Σ a b, Σ a², Σ b² and the number of matches of one direction, each weighted by f."""
     product, own_square, other_square, count = ZERO, ZERO, ZERO, ZERO
@@ -228,7 +228,7 @@ def sum_moments(points, values, transformed, looked_up, seen, surface_m2):
     return product, own_square, other_square, count
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def linearise_features(points, values, transformed, found, colour, centre, surface_m2, weight, rows):
     """Write the equations of features into `rows` (8, n): derivatives by ζ, residual and weight.
 

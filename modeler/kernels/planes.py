@@ -3,9 +3,9 @@
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from modeler.kernels.cache import njit
 from modeler.kernels.threads import over_rows
 
 # Columns of a cell, the 32 bytes that a likelihood reads for one pixel (float32).
@@ -38,7 +38,7 @@ class Ball(NamedTuple):
     """Standard deviation in m of the depth of a pixel."""
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def solve_symmetric_3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
     """Solve a symmetric 3×3 system by Cramer's rule.
 
@@ -64,7 +64,7 @@ def solve_symmetric_3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
     )
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def bounds(mask):
     """Return the bounding box of a mask (h, w): first row, row after the last, and the same for columns."""
     top, bottom, left, right = mask.shape[0], 0, mask.shape[1], 0
@@ -76,7 +76,7 @@ def bounds(mask):
     return min(top, bottom), bottom, min(left, right), right
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def padded(depth_m, mask, intrinsics, window, ball):
     """Return positions and inverse depths of a mask's pixels in a padded window; NaN elsewhere.
 
@@ -119,7 +119,7 @@ def padded(depth_m, mask, intrinsics, window, ball):
     return points
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def median_around(depth_m, row, column):
     """Return the median of the 3×3 depths about a pixel.
 
@@ -140,14 +140,14 @@ def median_around(depth_m, row, column):
     return ascending(lowest, middle, highest)[1]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def opposite(a, b, instead):
     """Return two depths, or twice the one instead if either is missing."""
     there = a > 0.0 and b > 0.0  # not NaN
     return a if there else instead, b if there else instead
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def ascending(a, b, c):
     """Return three numbers in ascending order."""
     a, b = min(a, b), max(a, b)
@@ -155,7 +155,7 @@ def ascending(a, b, c):
     return min(a, b), max(a, b), c
 
 
-@numba.njit(cache=True, fastmath={"contract", "nsz"})
+@njit(cache=True, fastmath={"contract", "nsz"})
 def add_line(centres, points, row, shift, pad, radius_m2, step, sums):
     """Sum, for every pixel of a row, over its neighbours on one line within the ball around it.
 
@@ -221,7 +221,7 @@ def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse_per_
     return cells
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _local_planes(
     rows, cells, depth_m, mask, silhouette, centres, points, window, intrinsics, ball, sigma_inverse_per_m
 ):
@@ -264,7 +264,7 @@ def _local_planes(
     return rows
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse_per_m):
     """Write the plane fitted to a pixel's neighbours into its cell (8,), if they determine one (method.md, eq. 1).
 
@@ -302,7 +302,7 @@ def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse_per_m):
         cell[KIND] = SURFACE
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def frontal_points(cells, mask, intrinsics, min_cosine):
     """Return the intersections of pixels' rays with their local planes, for planes that face the camera enough.
 
@@ -347,7 +347,7 @@ def frontal_points(cells, mask, intrinsics, min_cosine):
 _STEP, _DIAGONAL = np.float32(1.0), np.float32(math.sqrt(2.0))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def silhouette_distance(mask, limit_px):
     """Return the distance (h, w) float32 in px of every pixel from the mask, at most `limit_px`, by chamfer sweeps."""
     distance = np.full(mask.shape, limit_px, dtype=np.float32)
@@ -371,7 +371,7 @@ def silhouette_distance(mask, limit_px):
     return distance
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def propagate_from_row(line, above):
     """Propagate distances (w,) from the neighbouring row, straight and diagonally."""
     last = line.shape[0] - 1
@@ -382,7 +382,7 @@ def propagate_from_row(line, above):
         line[column] = min(line[column], above[column] + _STEP, above[inner] + _DIAGONAL)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def propagate_along_row(line):
     """Propagate distances (w,) along a row.
 

@@ -6,10 +6,10 @@ Single precision resolves 0.1 µm at a distance of 1 m, and one instruction proc
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from modeler.kernels.cache import njit
 from modeler.kernels.planes import (
     BACKGROUND,
     CELL_SIZE,
@@ -76,7 +76,7 @@ class Projection(NamedTuple):
     """Variance in m² of errors near silhouettes (eq. 31); that of the points is part of their variances."""
 
 
-@numba.njit(cache=True, forceinline=True)
+@njit(cache=True, forceinline=True)
 def invert(pose, inverse):
     """Write the inverse of a pose (12,), the rows of a 3×4 matrix, into `inverse` (12,)."""
     for k in range(3):
@@ -86,7 +86,7 @@ def invert(pose, inverse):
             inverse[4 * k + 3] -= pose[4 * m + k] * pose[4 * m + 3]
 
 
-@numba.njit(cache=True, forceinline=True)
+@njit(cache=True, forceinline=True)
 def write_transform(pose, backward, transform):
     """Write the rows of the 3×4 matrix that takes points of one view to the other into `transform` (12,).
 
@@ -109,7 +109,7 @@ def write_transform(pose, backward, transform):
             transform[k] /= pose[12]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def transform_points(pose, projection, transformed, pixels):
     """Transform points into the other camera (method.md, eq. 4): branch-free code, which compilers vectorise.
 
@@ -155,7 +155,7 @@ def transform_points(pose, projection, transformed, pixels):
         pixels[j] = pixel if inside else np.int32(-1)
 
 
-@numba.njit(cache=True, forceinline=True)
+@njit(cache=True, forceinline=True)
 def fetch_cells(count, pixels, cells, rim_m2, looked_up):
     """Copy the cells at the first `pixels` (n,) into columns of `looked_up` (8, n); `MISSING` outside the image.
 
@@ -172,7 +172,7 @@ def fetch_cells(count, pixels, cells, rim_m2, looked_up):
         looked_up[VARIANCE, j] += rim_m2 * rim * rim
 
 
-@numba.njit(cache=True, forceinline=True)
+@njit(cache=True, forceinline=True)
 def project(pose, projection, transformed, pixels, looked_up):
     """Transform points by a pose (12,) and look up their cells: `transform_points`, then `fetch_cells`.
 
@@ -182,7 +182,7 @@ def project(pose, projection, transformed, pixels, looked_up):
     fetch_cells(projection.points.shape[1], pixels, projection.cells, projection.rim_m2, looked_up)
 
 
-@numba.njit(cache=True, forceinline=True)
+@njit(cache=True, forceinline=True)
 def buffers(count):
     """Return buffers for `project` of n = `count` points: transformed points (9, n), pixels (n,), cells (8, n)."""
     transformed, pixels = np.empty((TRANSFORMED_ROWS, count), dtype=np.float32), np.empty(count, dtype=np.int32)
@@ -212,7 +212,7 @@ class LikelihoodParameters(NamedTuple):
     """`match_table` of η."""
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def match_table(hidden):
     """Return log((1 - hidden) exp(match) + hidden) at the nodes (method.md, eq. 5)."""
     table = np.empty(TABLE_STEPS + 1, dtype=np.float32)
@@ -222,7 +222,7 @@ def match_table(hidden):
     return table
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def plane_distance(transformed, looked_up, j):
     """Return the signed distance r in m of a transformed point from the plane of its cell, positive in front."""
     return (
@@ -233,7 +233,7 @@ def plane_distance(transformed, looked_up, j):
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def normal_agreement(transformed, looked_up, j):
     """Return the cosine between the normals of a transformed point and of the plane of its cell."""
     return (
@@ -243,7 +243,7 @@ def normal_agreement(transformed, looked_up, j):
     )
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def depth_below(transformed, parameters, j):
     """Return the depth of a transformed point below the support, beyond the clearance (method.md, eq. 21), in sd."""
     support = parameters.support
@@ -257,7 +257,7 @@ def depth_below(transformed, parameters, j):
     return max(-height_m * support[4], ZERO)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def sum_over_points(points, transformed, looked_up, parameters):
     """Return the log-likelihood of transformed points, and the number explained (method.md, eq. 5, 6 and 21).
 
@@ -303,7 +303,7 @@ def sum_over_points(points, transformed, looked_up, parameters):
     return total, explained
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def classify(pose, projection, parameters):
     """Return the class (n,) of each point of a `Projection` under one pose (12,)."""
     transformed, pixels, looked_up = buffers(projection.points.shape[1])
@@ -329,7 +329,7 @@ def classify(pose, projection, parameters):
     return classes
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def residual_excess(pose, projection, rims, blur_m):
     """Return the equations for the excess of squared residuals over their variances under one pose (12,).
 

@@ -1,8 +1,8 @@
 """Matches of surface measured by both views, their point-to-plane equations, and patches of the surface."""
 
-import numba
 import numpy as np
 
+from modeler.kernels.cache import njit
 from modeler.kernels.planes import KIND, NORMAL_X, NORMAL_Y, NORMAL_Z, RIM, SURFACE, VARIANCE
 from modeler.kernels.point_likelihood import (
     COLUMN,
@@ -34,7 +34,7 @@ RESIDUAL, WEIGHT, FACING_WEIGHT, OTHER_RIM, COLUMNS = 9, 10, 11, 14, 15
 _OF_SURFACE = np.float32(SURFACE)
 
 
-@numba.njit(cache=True, inline="always")
+@njit(cache=True, inline="always")
 def match_weight(points, transformed, found, residual, surface_m2, j):
     """Return the weight ω in 1/m² of a transformed point at a distance in m from the surface: 0 for no match."""
     variance = points[VARIANCE_M2, j] + found[VARIANCE, j] + surface_m2
@@ -44,7 +44,7 @@ def match_weight(points, transformed, found, residual, surface_m2, j):
     return weight if (found[KIND, j] == _OF_SURFACE) & near & agrees else ZERO
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def matches(pose, projection, surface_m):
     """Return the match of each point under one pose.
 
@@ -77,7 +77,7 @@ def matches(pose, projection, surface_m):
     return found
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def linearise(points, transformed, found, centre, surface_m2, rows):
     """Write the equations of matches into `rows` (9, n): derivatives by ζ, residual and weight, see `gauss_newton`."""
     cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
@@ -97,7 +97,7 @@ def linearise(points, transformed, found, centre, surface_m2, rows):
         rows[3, j], rows[4, j], rows[5, j] = normal_x, normal_y, normal_z
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def bisected(points, halvings):
     """Return the patch index (n,) of each point (n, 3), by recursive bisection across the longest side.
 
@@ -121,7 +121,7 @@ def bisected(points, halvings):
     return patches
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _longest_side(points, chosen):
     """Return the axis along which the points with these indices extend most."""
     longest, side = -1.0, 0
@@ -134,7 +134,7 @@ def _longest_side(points, chosen):
     return side
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _separate(order, values, first, middle, last):
     """Sort order[first:last] so far that no value before the middle is above one from there on (Hoare 1961, FIND)."""
     left, right = first, last - 1

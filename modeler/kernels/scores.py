@@ -1,8 +1,8 @@
 """Scores of poses: the log-likelihood of both views' surface, and the moments of its colours, in one projection."""
 
-import numba
 import numpy as np
 
+from modeler.kernels.cache import njit
 from modeler.kernels.photometric import NO_COLOURS, fetch_features, sum_moments
 from modeler.kernels.point_likelihood import buffers, project, sum_over_points, write_transform
 from modeler.kernels.threads import over_rows
@@ -32,7 +32,7 @@ def scores(poses, forward, backward, forward_parameters, backward_parameters, co
     return over_rows(_scores, poses, (forward, backward), parameters, colours, least=16)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _scores(poses, projections, parameters, colours):
     result = np.zeros((poses.shape[0], 6))
     transform = np.empty(12)

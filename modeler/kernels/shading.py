@@ -1,7 +1,8 @@
 """Shading of a matt surface by lamps fixed to the camera: harmonics of its normal in the camera's frame."""
 
 import numpy as np
-from numba import njit
+
+from modeler.kernels.cache import njit
 
 HARMONICS = 8  # up to the second degree, without the constant
 

@@ -12,8 +12,8 @@ surface along its normal, a weight, and the index of the surface point. Equation
 import math
 
 import numpy as np
-from numba import njit
 
+from modeler.kernels.cache import njit
 from modeler.kernels.shading import HARMONICS, harmonics
 from modeler.kernels.threads import over_rows
 

@@ -1,0 +1,182 @@
+"""Compiled kernels on disk: the only place that keeps them between processes.
+
+Numba's own cache knows a kernel by its file, although functions of other files are inlined in it, reads whatever lies
+there, and ends the program where nothing can be written. Here a kernel is known by the contents of all sources, the
+processor and the versions that it was compiled by; each file holds a digest of the rest, and in doubt the kernel is
+compiled again. Where nothing can be written, kernels stay in memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import platform
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, final
+
+import llvmlite
+import llvmlite.binding
+import numba
+import numpy as np
+from numba.core.caching import _Cache  # pyright: ignore[reportPrivateUsage]
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+
+_HERE: Final = Path(__file__).parent
+_DIGEST_BYTES: Final = 32
+_MOST_BYTES: Final = 1 << 26  # of a file
+_ALL_BYTES: Final = 1 << 24  # of all files together, with room to spare
+_SETTINGS: Final = ("NUM_THREADS", "THREADING_LAYER", "THREADING_LAYER_PRIORITY", "CACHE_DIR")
+"""Settings of Numba that do not change the code that it compiles."""
+
+
+def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **options: Any) -> Any:
+    """Compile a function as `numba.njit` does; with `cache`, keep the result here."""
+    if function is None:
+        return lambda function: njit(function, cache=cache, **options)
+    kernel: Any = numba.njit(**options)(function)
+    if cache:
+        kernel._cache = KernelCache(function)
+    return kernel
+
+
+def folder() -> Path:
+    """Return the folder in which kernels are kept first of all."""
+    return _folders()[0]
+
+
+def writable() -> bool:
+    """Return whether kernels can be kept."""
+    for probe in (folder / f"room-{os.getpid()}" for folder in _folders()):
+        if _written(probe, bytes(_ALL_BYTES)):
+            probe.unlink(missing_ok=True)
+            return True
+    return False
+
+
+def kept(module: str, name: str) -> bool:
+    """Return whether a kernel is kept on disk, whole and of the current sources."""
+    return any(_content(path) is not None for folder in _folders() for path in folder.glob(f"{module}.{name}-*"))
+
+
+@final
+class KernelCache(_Cache):
+    """The files of one kernel, one for each signature, named by everything that the compiled code depends on."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        """Take the function that is compiled."""
+        self._name = f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
+        cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
+        self._closure = dumps(cells) if cells else b""
+
+    @property
+    def cache_path(self) -> Any:
+        """The folder in which it is kept first of all."""
+        return str(folder())
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the compiled code for a signature; None if there is none that can be relied on."""
+        target_context.refresh()
+        name = self._file_name(sig, target_context.codegen())
+        for folder in _folders():
+            content = _content(folder / name)
+            if content is not None:
+                with suppress(Exception):  # whatever is wrong with it, it can be compiled
+                    return CompileResult._rebuild(target_context, *pickle.loads(content))
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep compiled code, in the first folder that takes it."""
+        if data.library.has_dynamic_globals or any(not lifted.can_cache for lifted in data.lifted):
+            return
+        name, content = self._file_name(sig, data.codegen), dumps(data._reduce())
+        for folder in _folders():
+            if _written(folder / name, hashlib.sha256(content).digest() + content):
+                return
+
+    def enable(self) -> None:
+        """Do nothing: it is always enabled."""
+
+    def disable(self) -> None:
+        """Do nothing."""
+
+    def flush(self) -> None:
+        """Do nothing: what is kept never becomes stale."""
+
+    def _file_name(self, sig: Any, codegen: Any) -> str:
+        key = repr((sig, codegen.magic_tuple())).encode() + self._closure
+        return f"{self._name}-{hashlib.sha256(key).hexdigest()[:16]}"
+
+
+def _folders() -> list[Path]:
+    """Return where kernels are read and written, in this order: where Numba's setting says, the sources, the user."""
+    user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    own = os.environ.get("NUMBA_CACHE_DIR")
+    first = Path(own).absolute() if own else _HERE / "__pycache__"
+    places = [first, Path(user) / "modeler"] if os.path.isabs(user) else [first]
+    return [place / f"kernels-{_MACHINE}-{_SOURCES}" for place in places]
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+
+def _machine() -> str:
+    """Return a digest of where and by what kernels are compiled."""
+    settings = sorted((k, v) for k, v in os.environ.items() if k.startswith("NUMBA_") and k[6:] not in _SETTINGS)
+    versions = (sys.version, sys.flags.optimize, numba.__version__, llvmlite.__version__, np.__version__)
+    processor = (llvmlite.binding.get_host_cpu_name(), llvmlite.binding.get_host_cpu_features().flatten())
+    return _digest(str(_HERE), platform.machine(), processor, versions, settings)
+
+
+_SOURCES: Final = _digest(*((path.name, path.read_bytes()) for path in sorted(_HERE.glob("*.py"))))
+_MACHINE: Final = _machine()
+
+
+def _content(path: Path) -> bytes | None:
+    """Return what a file holds; None unless it is whole, a regular file, and of somebody who may change the sources."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        with os.fdopen(descriptor, "rb") as file:
+            status = os.fstat(descriptor)
+            trusted = status.st_uid in (0, os.geteuid(), os.stat(__file__).st_uid) and not status.st_mode & 0o022
+            if not (stat.S_ISREG(status.st_mode) and status.st_size <= _MOST_BYTES and trusted):
+                return None
+            data = file.read(_MOST_BYTES)
+    except OSError:
+        return None
+    content = data[_DIGEST_BYTES:]
+    return content if hashlib.sha256(content).digest() == data[:_DIGEST_BYTES] else None
+
+
+def _written(path: Path, data: bytes) -> bool:
+    """Replace a file atomically, and return whether that was possible."""
+    part = None
+    try:
+        if not path.parent.is_dir():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            for stale in _stale(path.parent):
+                shutil.rmtree(stale, ignore_errors=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
+            part = file.name
+            file.write(data)
+            os.fchmod(file.fileno(), 0o644)  # others may use it, and nobody else write it
+        os.replace(part, path)
+    except OSError:
+        if part is not None:
+            with suppress(OSError):
+                os.unlink(part)
+        return False
+    return True
+
+
+def _stale(folder: Path) -> Iterator[Path]:
+    """Yield the folders of kernels that this machine compiled from other contents of the same sources."""
+    yield from (other for other in folder.parent.glob(f"kernels-{_MACHINE}-*") if other != folder)

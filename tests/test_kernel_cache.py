@@ -1,0 +1,139 @@
+"""Kernels kept between processes are current and whole, or compiled again."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from modeler import kernels
+from modeler.cli import compiling
+from modeler.kernels import cache
+
+_INNER = "from toy.cache import njit\n\n\n@njit(cache=True, inline='always')\ndef inner(x):\n    return x + {}\n"
+_OUTER = """\
+from toy.cache import njit
+from toy.inner import inner
+
+@njit(cache=True)
+def outer(x):
+    return inner(x)
+"""
+_CALL = """\
+from numba.core import event
+with event.install_recorder("numba:compile") as recorder:
+    from toy import cache
+    from toy.outer import outer
+    print(outer(1.0), len(recorder.buffer), cache.kept("outer", "outer"), cache.writable())
+"""
+
+
+@pytest.fixture
+def toy(tmp_path: Path) -> Path:
+    """Return a folder with a package of two kernels, of which one is inlined in the other, and the cache."""
+    (tmp_path / "toy").mkdir()
+    (tmp_path / "toy" / "__init__.py").touch()
+    shutil.copy(str(cache.__file__), tmp_path / "toy" / "cache.py")
+    (tmp_path / "toy" / "inner.py").write_text(_INNER.format(1))
+    (tmp_path / "toy" / "outer.py").write_text(_OUTER)
+    return tmp_path
+
+
+def called(toy: Path, **settings: str) -> list[str]:
+    """Return the result in a process of its own, the number of events of compiling, and the state of the cache."""
+    environment = {**os.environ, "PYTHONPATH": str(toy), "HOME": str(toy / "home"), **settings}
+    ended = subprocess.run(
+        [sys.executable, "-c", _CALL], env=environment, capture_output=True, text=True, check=False, timeout=100.0
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    return ended.stdout.split()
+
+
+def files(toy: Path) -> list[Path]:
+    return [path for path in toy.rglob("kernels-*/*") if path.is_file()]
+
+
+def test_a_kernel_is_compiled_once(toy: Path) -> None:
+    first, second = called(toy), called(toy)
+    assert first[0] == second[0] == "2.0"
+    assert int(first[1]) > int(second[1]) == 0
+    assert second[2:] == ["True", "True"]
+    assert not list(toy.glob("home/**/kernels-*"))
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_kernel_is_compiled_again_once_a_function_inlined_in_it_has_changed(toy: Path, own: bool) -> None:
+    settings = {"NUMBA_CACHE_DIR": str(toy / "elsewhere")} if own else {}
+    assert called(toy, **settings)[0] == "2.0"
+    times = os.stat(toy / "toy" / "inner.py")
+    (toy / "toy" / "inner.py").write_text(_INNER.format(5))
+    os.utime(toy / "toy" / "inner.py", ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert called(toy, **settings)[0] == "6.0"
+    assert bool(list(toy.glob("elsewhere/kernels-*"))) == own
+    assert len({path.parent for path in files(toy)}) == 1  # what is stale is removed
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def fifo(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "empty": lambda path: path.write_bytes(b""),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-1]),
+    "flipped": flip,
+    "fifo": fifo,
+    "writable by others": lambda path: path.chmod(0o666),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_kernels_are_compiled_again(toy: Path, damage: str) -> None:
+    called(toy)
+    whole = {path: path.read_bytes() for path in files(toy)}
+    assert whole
+    for path in whole:
+        DAMAGES[damage](path)
+    assert called(toy)[0] == "2.0"
+    assert {path.name for path in files(toy)} == {path.name for path in whole}
+    assert int(called(toy)[1]) == 0
+
+
+def test_kernels_of_other_settings_are_not_taken(toy: Path) -> None:
+    called(toy)
+    assert int(called(toy, NUMBA_OPT="1")[1]) > 0
+
+
+@pytest.mark.parametrize("place", ["/dev/null/kernels", "/proc/kernels"])
+def test_where_nothing_can_be_written_kernels_stay_in_memory(toy: Path, place: str) -> None:
+    assert called(toy, NUMBA_CACHE_DIR=place, HOME=place)[::3] == ["2.0", "False"]
+    assert not files(toy)
+
+
+def test_a_home_in_the_current_folder_is_none(toy: Path) -> None:
+    called(toy, NUMBA_CACHE_DIR="/dev/null/kernels", HOME="", XDG_CACHE_HOME="")
+    assert not files(toy)
+
+
+def test_that_kernels_cannot_be_kept_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cache, "kept", lambda module, name: False)
+    monkeypatch.setattr(cache, "writable", lambda: False)
+    reports: list[Callable[[str], None]] = []
+    monkeypatch.setattr(kernels, "on_compiling", reports.append)
+    compiling.compile_kernels()
+    assert capsys.readouterr().err.startswith(f"modeler: compiled kernels cannot be kept in {cache.folder()}")
+    reports[0]("tsdf")
+    assert "compiling kernels, for this command alone: 1 of" in capsys.readouterr().err
