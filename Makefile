@@ -42,26 +42,26 @@ test-slow: setup
 	$(BIN)/pytest -m slow $(TWO)
 
 calibrate: setup
-	PYTHONPATH=tests $(BIN)/python -m calibration
-	PYTHONPATH=tests $(BIN)/python -m calibration.by_camera
+	$(BIN)/python -m studies calibration
+	$(BIN)/python -m studies calibration.by_camera
 
 trust: setup
-	PYTHONPATH=tests $(BIN)/python -m trust --jobs 2
+	$(BIN)/python -m studies trust --jobs 2
 
 ablation: setup
-	PYTHONPATH=tests $(BIN)/python -m ablation
+	$(BIN)/python -m studies ablation
 
 bench: setup
-	$(BIN)/python tests/bench
+	$(BIN)/python -m studies bench
 
 bench-gpu: setup
-	$(BIN)/python tests/bench/gpu.py
+	$(BIN)/python -m studies bench.gpu
 
 scale: setup
-	PYTHONPATH=tests $(BIN)/python -m scale builds runs/scale
+	$(BIN)/python -m studies scale builds runs/scale
 
 same: setup
-	PYTHONPATH=tests $(BIN)/python -m same_bytes $(COMMIT)
+	$(BIN)/python -m studies same_bytes $(COMMIT)
 
 audit: setup
 	.ci/audit

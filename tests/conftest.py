@@ -14,14 +14,14 @@ if (
 
 import numpy as np
 import pytest
-from commanded import QUICK, Run, runner
-from recordings import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
+from command_runner import QUICK, Run, runner
 from turning_box import COUNT, LOST, steps
 
 from modeler import concurrency
 from modeler.cli import main
 from modeler.sequences import bundled, write_bop
 from modeler.types import Frame, Step
+from studies.formats.image_folders import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def run() -> list[Step]:
 @pytest.fixture(scope="session")
 def recording(run: list[Step], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[int, dict[str, Any]]]:
     """Return what is recorded of that run, as `streamed.read` has it."""
-    from streamed import record  # and with it Rerun, which few tests need
+    from rerun_recordings import record  # and with it Rerun, which few tests need
 
     return record(tmp_path_factory.mktemp("viz") / "recording.rrd", run)
 

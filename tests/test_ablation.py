@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ablation.__main__ import registered
-from ablation.pairs import Case
-from ablation.tables import table
-from ablation.variants import VARIANTS, Variant
-from slow import sampled
+from slow_cases import sampled
 
 from modeler.evaluation import true_motion
 from modeler.priors import GeneralPrior
 from modeler.rays import Sensor
 from modeler.sequences import bundled, open_sequence
+from studies.ablation.__main__ import registered
+from studies.ablation.pairs import Case
+from studies.ablation.tables import table
+from studies.ablation.variants import VARIANTS, Variant
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import small_gicp
 import tabletop
-from refusal import refused
+from input_errors import refused
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 

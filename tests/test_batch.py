@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commanded import QUICK, Run
-from kills.trials import SAME
-from stand_in import PATIENCE_S, book, sequence, started, wait_for
+from command_runner import QUICK, Run
+from fake_builder import PATIENCE_S, book, sequence, started, wait_for
 
 from modeler.cli import engines, jobs, parsed
 from modeler.cli.batch import Batch
@@ -23,13 +22,14 @@ from modeler.cli.manifest import Row, named, read_manifest
 from modeler.cli.models import TABLE, models_in
 from modeler.export.models_table import read_table
 from modeler.types import InputError
+from studies.kills.trials import SAME
 
 HERE = Path(__file__).parent
 
 
 @pytest.fixture(autouse=True)
 def _stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jobs, "BUILDER", "stand_in")
+    monkeypatch.setattr(jobs, "BUILDER", "fake_builder")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HERE.parent), str(HERE)]))
 
 
@@ -236,7 +236,7 @@ def alive(out: Path) -> set[int]:
 
     def running(pid: int) -> bool:
         try:
-            return "stand_in" in Path(f"/proc/{pid}/cmdline").read_text()
+            return "fake_builder" in Path(f"/proc/{pid}/cmdline").read_text()
         except OSError:
             return False
 

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from commanded import QUICK
-from stand_in import book, sequence, started, wait_for
+from command_runner import QUICK
+from fake_builder import book, sequence, started, wait_for
 
 from modeler.cli.models import TABLE
 from modeler.export.models_table import read_table
@@ -29,7 +29,7 @@ WORKER = """
 import sys
 from modeler.cli import jobs
 from distributed.cli.dask_worker import main
-jobs.BUILDER = "stand_in"
+jobs.BUILDER = "fake_builder"
 {more}
 main()
 """

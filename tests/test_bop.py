@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bop_scenes import CAMERA, INDICES, META, frame, random_frames, random_truth, written
 from hypothesis import given
 from hypothesis import strategies as st
+from input_errors import refused
 from PIL import Image
-from recordings import png_claiming
-from refusal import refused
-from small_scene import CAMERA, INDICES, META, frame, random_frames, random_truth, written
 
 from modeler.sequences import BopSequence, open_sequence, survey, write_bop
 from modeler.types import Frame, InputError, SensorNoise
+from studies.formats.image_folders import png_claiming
 
 
 @pytest.fixture

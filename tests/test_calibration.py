@@ -7,13 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration.__main__ import panels, run
-from calibration.specimens import PRINTED, SPECIMENS, Specimen, load_specimen, recipe_names
-from calibration.study import CONTROL, MEASURES, OURS, OUTSIDE, Condition, Study, Trial, judged, staged
-from calibration.tables import rows, text
 from scipy.ndimage import binary_erosion
 from scipy.spatial import KDTree
-from slow import sampled
+from slow_cases import sampled
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, sample_surface, true_motion
@@ -24,6 +20,10 @@ from modeler.registration.visibility.sampling import AdaptiveSampler
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import AbstractPoseDensity, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
 from modeler.viz.figures import coverage_curves
+from studies.calibration.__main__ import panels, run
+from studies.calibration.specimens import PRINTED, SPECIMENS, Specimen, load_specimen, recipe_names
+from studies.calibration.study import CONTROL, MEASURES, OURS, OUTSIDE, Condition, Study, Trial, judged, staged
+from studies.calibration.tables import rows, text
 
 BLANK = Trial("tuning", "n-fold", "box", "usual", "table", OURS, 1, 0, outcome=OUTSIDE)
 CENTROID_M = np.array([0.05, -0.02, 0.8])

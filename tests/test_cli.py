@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from commanded import BOX, FILES, Run
+from command_runner import BOX, FILES, Run
 
 from modeler import priors, se3
 from modeler.cli import compose, main

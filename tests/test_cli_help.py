@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commanded import FILES, Run
+from command_runner import FILES, Run
 
 from modeler import priors
 from modeler.cli import main, parsed

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commanded import BOX, QUICK
+from command_runner import BOX, QUICK
 
 from modeler.cli import main
 from modeler.cli.advice import outcome_advice

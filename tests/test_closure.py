@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from closing import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, judged, posterior_of, told, turned, view, witnessed
+from closure_runs import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, judged, posterior_of, told, turned, view, witnessed
 
 from modeler import se3
 from modeler.closure import Closer, MapView

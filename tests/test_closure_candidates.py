@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from closing import CENTROID_M, Run, posterior_of, turned
-from rings import edge
+from closure_runs import CENTROID_M, Run, posterior_of, turned
+from ring_graphs import edge
 
 from modeler import se3
 from modeler.closure import Closer, ConsistencyModel, MapView

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from closing import Run
+from closure_runs import Run
 
 from modeler import se3
 from modeler.closure import Closer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from commanded import FILES, Run
+from command_runner import FILES, Run
 
 RECIPE = {
     "name": "step",

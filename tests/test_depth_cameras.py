@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration.by_camera import (
+
+from modeler.range_noise import range_noise
+from modeler.types import Frame
+from studies.calibration.by_camera import (
     CameraStudy,
     Trial,
     conformal_factors,
@@ -19,12 +22,9 @@ from calibration.by_camera import (
     table,
     text,
 )
-from calibration.depth_cameras import CAMERAS, TimeOfFlight, World
-from calibration.specimens import Specimen
-from loops import cameras
-
-from modeler.range_noise import range_noise
-from modeler.types import Frame
+from studies.calibration.depth_cameras import CAMERAS, TimeOfFlight, World
+from studies.calibration.specimens import Specimen
+from studies.loops import cameras
 
 CUBE = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (0.6, 0.7)])
 FACES = np.array([[0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3], [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5],

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tabletop
-from oracles import BODY, POSES, Oracle, Recording, experiment, trial
+from oracle_experiments import BODY, POSES, Oracle, Recording, experiment, trial
 from PIL import Image
 
 from modeler import se3

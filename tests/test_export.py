@@ -10,7 +10,7 @@ import numpy.typing as npt
 import open3d as o3d
 import pytest
 import trimesh
-from made_up import an_edge, ball, made_up_steps, strict_json
+from run_builders import an_edge, ball, made_up_steps, strict_json
 from scipy.spatial.transform import Rotation
 from turning_box import steps
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from made_up import ball
+from run_builders import ball
 from scipy.spatial.transform import Rotation
 
 from modeler import se3

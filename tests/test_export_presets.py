@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from commanded import Run
-from made_up import ball
+from command_runner import Run
+from run_builders import ball
 
 from modeler import se3
 from modeler.export import physics, solids

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_up import META, made_up_steps, strict_json
-from rings import OBJECT_M, edge, measured, ring, spin, turntable
+from ring_graphs import OBJECT_M, edge, measured, ring, spin, turntable
+from run_builders import META, made_up_steps, strict_json
 
 from modeler import se3
 from modeler.export import (

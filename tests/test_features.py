@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from calibration.specimens import load_specimen
-from calibration.study import Condition, rendered_views, staged
 from prior_cases import surface
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.features import FeatureMatcher, fpfh, kabsch, mutual_matches
 from modeler.sequences.rendering.renderer import RenderedSequence
+from studies.calibration.specimens import load_specimen
+from studies.calibration.study import Condition, rendered_views, staged
 
 MOVED = se3.exp(np.array([0.3, -0.8, 0.5, 0.1, -0.2, 0.4]))
 

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rings import edge, turntable
+from ring_graphs import edge, turntable
 
 from modeler import se3
 from modeler.closure.map_view import composed

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from prior_cases import views
 from scipy.spatial.transform import Rotation
-from slow import sampled
+from slow_cases import sampled
 from test_kernels import ANISOTROPIC, INTRINSICS, ISOTROPIC, SHAPE, random_pose
 
 from modeler import se3

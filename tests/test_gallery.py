@@ -12,7 +12,7 @@ from typing import Any
 import chromium
 import numpy as np
 import pytest
-from commanded import Run
+from command_runner import Run
 from PIL import Image
 
 from modeler.cli.jobs import NOTES

@@ -3,7 +3,6 @@
 import ctypes
 import importlib.util
 import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -211,9 +210,7 @@ def test_the_source_compiles_for_a_gpu(tmp_path):
 def test_the_programme_of_measurements_runs_at_small_sizes(capsys, monkeypatch):
     arguments = ["bench-gpu", "--device", "warp-cpu", "--samples", "20000", "--pairs", "3", "--runs", "1"]
     monkeypatch.setattr("sys.argv", arguments)
-    path = Path(__file__).parent / "bench" / "gpu.py"
-    monkeypatch.syspath_prepend(str(path.parent))
     with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(path), run_name="__main__")
+        runpy.run_module("studies.bench.gpu", run_name="__main__")
     assert not ended.value.code
     assert "20,000 samples of the general prior" in capsys.readouterr().out

@@ -10,13 +10,13 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from rings import OBJECT_M, edge, ring, spin, spun
-from rings import covariance as _covariance
-from rings import edge as _edge
-from rings import measured as _measured
-from rings import nees as _nees
-from rings import ring as _ring
-from rings import turntable as _truth
+from ring_graphs import OBJECT_M, edge, ring, spin, spun
+from ring_graphs import covariance as _covariance
+from ring_graphs import edge as _edge
+from ring_graphs import measured as _measured
+from ring_graphs import nees as _nees
+from ring_graphs import ring as _ring
+from ring_graphs import turntable as _truth
 from scipy import stats
 
 from modeler import se3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rings import OBJECT_M, covariance, edge, nees, ring, rotation_error, spin
+from ring_graphs import OBJECT_M, covariance, edge, nees, ring, rotation_error, spin
 
 from modeler import se3
 from modeler.graph import CommonAxis, PoseGraph, solve

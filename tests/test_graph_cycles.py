@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rings import covariance, edge, ring, spin
+from ring_graphs import covariance, edge, ring, spin
 
 from modeler import se3
 from modeler.graph.modes import cycles

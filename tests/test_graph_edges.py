@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from prior_cases import edges, solution
-from rings import OBJECT_M, covariance, edge, measured, nees, ring, spin, spun, turntable
+from ring_graphs import OBJECT_M, covariance, edge, measured, nees, ring, spin, spun, turntable
 from scipy.spatial.transform import Rotation
 from turning_box import steps
 

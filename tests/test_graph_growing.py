@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from rings import edge, measured, spin, spun, turntable
+from ring_graphs import edge, measured, spin, spun, turntable
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, covariance, optimise, solve

@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 import pytest
-from rings import OBJECT_M, covariance, edge, measured, nees, ring, rotation_error, spin, turntable
+from ring_graphs import OBJECT_M, covariance, edge, measured, nees, ring, rotation_error, spin, turntable
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, modes, solve

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from loops import covariances
-from rings import OBJECT_M, edge, measured, nees, ring, rotation_error, spin, spun, turntable
+from ring_graphs import OBJECT_M, edge, measured, nees, ring, rotation_error, spin, spun, turntable
 from scipy import stats
-from slow import sampled
+from slow_cases import sampled
 
 from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
 from modeler.graph.covariance import chi_square_quantile
 from modeler.types import Array, Camera, Edge, Frame, PoseGaussian, RayImage, Solution
 from modeler.verdict.evidence import spread_of_positions
+from studies.loops import covariances
 
 SEEDS = 120
 CAMERA = Camera(1, 1, 1.0, 1.0, 0.0, 0.0)

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import Recorder
+from bop_scenes import CAMERA, INDICES
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import WRITERS, write_tum
-from small_scene import CAMERA, INDICES
 
 from modeler import se3
 from modeler.cli import main
 from modeler.sequences import AbstractSequence, KeptSequence, bundled, frame_range, open_sequence, write_bop
 from modeler.types import Frame, InputError
+from studies.formats.image_folders import WRITERS, write_tum
+from studies.formats.ros_bags import Recorder
 
 
 @pytest.fixture(params=WRITERS)

@@ -15,16 +15,16 @@ from pathlib import Path
 import lz4.frame
 import numpy as np
 import pytest
-from bags import Recorder
 from PIL import Image
-from recordings import small_frames, write_open3d
 from rosbags import rosbag1, rosbag2
-from test_inputs_clouds import WRITERS as CLOUDS
 
 from modeler.cli import main
 from modeler.sequences import open_sequence
 from modeler.sequences.ros import bag
 from modeler.sequences.ros.bag import Bag, from_bz2, from_lz4, from_zstd
+from studies.formats.clouds import WRITERS as CLOUDS
+from studies.formats.image_folders import small_frames, write_open3d
+from studies.formats.ros_bags import Recorder
 
 MEGABYTE = 1 << 20
 PACKERS: dict[str, Callable[[bytes], bytes]] = {"lz4": lz4.frame.compress, "zstd": bag.zstd.compress}

@@ -14,12 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commanded import QUICK
-from recordings import small_frames
+from command_runner import QUICK
 
 from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.sequences import open_sequence, write_bop
+from studies.formats.image_folders import small_frames
 
 
 def with_files_of_at_most(size: int, *arguments: str) -> int:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from recordings import png_claiming, save
 
 from modeler.cli import main
+from studies.formats.image_folders import png_claiming, save
 
 Damage = Callable[[Path], object]
 

@@ -1,4 +1,4 @@
-"""Damaged inputs of every format: read, or refused in one line. `python -m fuzz` tries many more."""
+"""Damaged inputs of every format: read, or refused in one line. `python -m studies fuzz` tries many more."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.mutate import mutated, with_sums
-from fuzz.targets import TARGETS, fresh, tiny, truth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modeler.sequences import open_sequence, read_noise, survey, write_bop
 from modeler.types import InputError
+from studies.fuzz.mutate import mutated, with_sums
+from studies.fuzz.targets import TARGETS, fresh, tiny, truth
 
 INPUTS = 40
 

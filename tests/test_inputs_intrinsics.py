@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from recordings import WRITERS, save, write_open3d, write_tum
 
 from modeler.sequences import Overrides, open_sequence, survey, write_bop
 from modeler.types import Frame, InputError
+from studies.formats.image_folders import WRITERS, save, write_open3d, write_tum
 
 
 @pytest.fixture(params=WRITERS)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-import struct
 import sys
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded import FOLDER, scene, unpacked
-from recorded import kinect as recording
-from recorded.kinect import calibration
 
 from modeler import se3
 from modeler.cli import main
@@ -21,54 +17,16 @@ from modeler.sequences.input_files import Node
 from modeler.sequences.kinect import KinectSequence, Matroska, colour_from_depth, colour_lens, depth_lens
 from modeler.sequences.lens import Alignment, Lens
 from modeler.types import Camera, InputError
+from studies.formats.kinect import HEIGHT, WIDTH, write_mkv
+from studies.formats.recorded import FOLDER, scene, unpacked
+from studies.formats.recorded import kinect as recording
+from studies.formats.recorded.kinect import calibration
 
-WIDTH, HEIGHT = 320, 288  # NFOV_2X2BINNED
-COLOUR_SIZE = (1280, 720)
 COLOUR_FROM_DEPTH = colour_from_depth(Node(calibration(), Path("c.json")))
 
 
-def write_mkv(path: Path, count: int = 3, *, attached: dict | None = None, colour: bool = True) -> list[np.ndarray]:
-    """Write a recording of a slanted plane and return its raw depth images."""
-    av = pytest.importorskip("av")
-    container = av.open(str(path), "w", format="matroska", options={"allow_raw_vfw": "1"})
-    depth = container.add_stream("rawvideo", rate=30)
-    depth.width, depth.height, depth.pix_fmt = WIDTH, HEIGHT, "gray16be"
-    depth.metadata["title"] = "DEPTH"
-    tracks = [depth]
-    if colour:
-        picture = container.add_stream("mjpeg", rate=30)
-        picture.width, picture.height, picture.pix_fmt = *COLOUR_SIZE, "yuvj420p"
-        picture.metadata["title"] = "COLOR"
-        tracks.append(picture)
-    content = json.dumps(calibration() if attached is None else attached).encode()
-    container.add_attachment("calibration.json", "application/octet-stream", content + b"\0")
-    images = []
-    for place in range(count):
-        slope = np.linspace(600.0, 1200.0, WIDTH)[None, :] + 5.0 * place + np.zeros((HEIGHT, 1))
-        raw = np.rint(slope).astype(np.uint16)
-        raw[:20, :20] = 0
-        images.append(raw)
-        frame = av.VideoFrame.from_ndarray(raw, format="gray16le").reformat(format="gray16be")
-        frame.pts = place
-        container.mux(depth.encode(frame))
-        if colour:
-            half = np.full((COLOUR_SIZE[1], COLOUR_SIZE[0], 3), (200, 40, 40), np.uint8)
-            half[:, COLOUR_SIZE[0] // 2 :] = (40, 40, 200)
-            frame = av.VideoFrame.from_ndarray(half, format="rgb24")
-            frame.pts = place
-            container.mux(tracks[1].encode(frame))
-    for track in tracks:
-        container.mux(track.encode())
-    container.close()
-    # The library leaves out which kind of raw image it is; recorders of the camera say b16g.
-    written = path.read_bytes()
-    header = struct.pack("<IiiHHI", 40, WIDTH, -HEIGHT, 1, 16, 0)
-    assert header in written
-    path.write_bytes(written.replace(header, struct.pack("<IiiHH", 40, WIDTH, HEIGHT, 1, 16) + b"b16g"))
-    return images
-
-
 def test_depth_comes_out_straight_and_colour_aligned(tmp_path: Path) -> None:
+    pytest.importorskip("av")
     path = tmp_path / "eine Aufnahme.mkv"
     images = write_mkv(path)
     sequence = open_sequence(path)
@@ -174,6 +132,7 @@ def test_a_mode_bins_and_crops_the_sensor() -> None:
 
 
 def test_a_recording_without_colour_is_read_and_converted(tmp_path: Path) -> None:
+    pytest.importorskip("av")
     write_mkv(tmp_path / "s.mkv", colour=False)
     assert open_sequence(tmp_path / "s.mkv").frame(0).colour is None
     assert main(["convert", str(tmp_path / "s.mkv"), "--out", str(tmp_path / "bop")]) == 0
@@ -193,6 +152,7 @@ def test_broken_recordings_are_one_line(tmp_path: Path, capfd: pytest.CaptureFix
         tree["CalibrationInformation"]["Cameras"][0]["Intrinsics"]["ModelType"] = "CALIBRATION_LensDistortionModelTheta"
     if fault == "no lens":
         tree["CalibrationInformation"]["Cameras"][0]["Intrinsics"]["ModelParameters"] = [0] * 14
+    pytest.importorskip("av")
     write_mkv(path, attached={"no": 1} if fault == "wrong calibration" else tree)
     content = path.read_bytes()
     damaged = {

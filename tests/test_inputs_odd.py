@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commanded import QUICK
-from fuzz.targets import tiny
-from recordings import small_frames, small_truth
+from command_runner import QUICK
 
 from modeler import se3
 from modeler.cli import main
 from modeler.sequences import bundled, open_sequence, write_bop
 from modeler.types import Camera, Frame, Outcome
+from studies.formats.image_folders import small_frames, small_truth
+from studies.fuzz.targets import tiny
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import Recorder
 from PIL import Image
-from recordings import raw_depth, save, write_bundlesdf, write_open3d, write_tum
-from test_inputs_clouds import WRITERS as CLOUDS
 
 from modeler.sequences import open_sequence, survey, write_bop
 from modeler.types import Frame, InputError
+from studies.formats.clouds import WRITERS as CLOUDS
+from studies.formats.image_folders import raw_depth, save, write_bundlesdf, write_open3d, write_tum
+from studies.formats.ros_bags import Recorder
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3", "", ".pcd", ".ply"])

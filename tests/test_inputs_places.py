@@ -14,17 +14,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-import commanded
+import command_runner
 import pytest
-from fuzz.special import SPECIAL, lengthen, remove, replace_by
-from fuzz.targets import TARGETS, Target, fresh
-from recordings import small_frames, small_truth
-from refusal import refused
+from input_errors import refused
 
 from modeler.cli import main
 from modeler.regular_files import check_regular, create_regular, read_json, read_regular
 from modeler.sequences import open_sequence, write_bop
 from modeler.types import InputError
+from studies.formats.image_folders import small_frames, small_truth
+from studies.fuzz.special import SPECIAL, lengthen, remove, replace_by
+from studies.fuzz.targets import TARGETS, Target, fresh
 
 
 def test_the_folder_of_a_run_is_no_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,7 +224,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for run in ("a", "b"):
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)
-            commanded.main(["build", "s", "--out", run, "--prior", "table", "--method", "icp"])
+            command_runner.main(["build", "s", "--out", run, "--prior", "table", "--method", "icp"])
     return folder
 
 
@@ -264,7 +264,7 @@ def test_every_command_refuses_special_files(
     monkeypatch.chdir(tmp_path / "in")
     replace_by(kind, Path(name))
     with in_time():
-        ended = commanded.runner(capfd)(*arguments)
+        ended = command_runner.runner(capfd)(*arguments)
     assert (ended.status, ended.out) == (2, "")
     last = ended.err.splitlines()[-1]
     assert last.startswith("modeler: ")
@@ -282,7 +282,7 @@ def test_a_resumed_build_makes_again_what_is_no_kept_pair(
     names: list[str] = []
     monkeypatch.setattr("modeler.export.pairs.Pairs.drop", lambda self: names.extend(os.listdir(self.folder)))
     Path("a/report.json").write_text(json.dumps(report | {"complete": False}))
-    assert commanded.runner(capfd)(*build).status in (0, 3)
+    assert command_runner.runner(capfd)(*build).status in (0, 3)
     assert names
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path / "in")
@@ -290,5 +290,5 @@ def test_a_resumed_build_makes_again_what_is_no_kept_pair(
     for name in names:
         replace_by("FIFO", Path("a/.pairs") / name)
     with in_time():
-        assert commanded.runner(capfd)(*build).status in (0, 3)
+        assert command_runner.runner(capfd)(*build).status in (0, 3)
     assert json.loads(Path("a/report.json").read_text())["poses"] == report["poses"]

@@ -11,12 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bags import Recorder
-from recorded import realsense as recording
-from recorded import scene, unpacked
-from recordings import raw_depth, small_frames
-from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
 from modeler.cli import main
 from modeler.export import RunFolder
@@ -25,47 +19,10 @@ from modeler.sequences.lens import Lens, lens_of_model
 from modeler.sequences.live import AbstractCamera, begin, open_camera
 from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
-
-TURN = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
-SHIFT_M = np.array([0.015, 0.001, 0.002])
-STREAMS = ("/device_0/sensor_0/Depth_0", "/device_0/sensor_1/Color_0")
-
-
-# What the recorder of versions up to 2.56 writes: messages of ROS 1, with four bytes behind each image.
-
-
-class OldRecorder(Recorder):
-    """Adds to a bag what RealSense's recorder adds."""
-
-    def _fill(self, writer: Any, frames: list[Frame]) -> None:
-        store = get_typestore(Stores.ROS1_NOETIC)
-        types = store.types
-
-        def send(topic: str, message: Any) -> None:
-            connection = writer.add_connection(topic, message.__msgtype__, typestore=store)
-            writer.write(connection, 1, bytes(store.serialize_ros1(message, message.__msgtype__)))
-
-        send("/device_0/sensor_0/option/Depth Units/value", types["std_msgs/msg/Float32"](data=0.00025))
-        for stream, turn, shift in ((STREAMS[0], np.eye(3), np.zeros(3)), (STREAMS[1], TURN, SHIFT_M)):
-            x, y, z, w = Rotation.from_matrix(turn).as_quat()
-            pose = types["geometry_msgs/msg/Transform"](
-                translation=types["geometry_msgs/msg/Vector3"](*map(float, shift)),
-                rotation=types["geometry_msgs/msg/Quaternion"](*map(float, (-x, -y, -z, -w))),
-            )
-            send(f"{stream}/tf/1", pose)
-        write = writer.write
-        writer.write = lambda connection, when, data: write(
-            connection, when, bytes(data) + (b"\0" * 4 if connection.msgtype.endswith("/Image") else b"")
-        )
-        super()._fill(writer, frames)
-
-
-NAMES = {
-    "depth": f"{STREAMS[0]}/image/data",
-    "info": f"{STREAMS[0]}/info/camera_info",
-    "colour": f"{STREAMS[1]}/image/data",
-    "colour_info": f"{STREAMS[1]}/info/camera_info",
-}
+from studies.formats.image_folders import raw_depth, small_frames
+from studies.formats.recorded import realsense as recording
+from studies.formats.recorded import scene, unpacked
+from studies.formats.ros_bags import NAMES, SHIFT_M, TURN, OldRealSense
 
 
 def assert_motion(sequence: object) -> None:
@@ -79,7 +36,7 @@ def assert_motion(sequence: object) -> None:
 
 def test_bags_of_the_old_recorder_are_read(tmp_path: Path) -> None:
     frames = small_frames(2)
-    recorder = OldRecorder("mono16", "rgb8", names=NAMES, colour_scale=1.1)
+    recorder = OldRealSense("mono16", "rgb8", names=NAMES, colour_scale=1.1)
     sequence = open_sequence(recorder.write(tmp_path / "s.bag", frames))
     assert sequence.depth_unit == "0.25 mm (/device_0/sensor_0/option/Depth Units/value)"
     assert "by RealSense" in sequence.layout

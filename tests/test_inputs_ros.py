@@ -10,14 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bags import START_NS, Recorder
-from recorded import foxglove, scene, unpacked
-from recordings import small_frames
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from scipy.spatial.transform import Rotation
+from rosbags.typesys import Stores, get_typestore
 
-from modeler import se3
 from modeler.cli import main
 from modeler.sequences import Overrides, open_sequence
 from modeler.sequences.lens import Lens
@@ -25,6 +20,9 @@ from modeler.sequences.ros import messages
 from modeler.sequences.ros.bag import zstd
 from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
+from studies.formats.image_folders import small_frames
+from studies.formats.recorded import foxglove, scene, unpacked
+from studies.formats.ros_bags import COLOUR_FROM_DEPTH, START_NS, Recorder, Rig
 
 SUFFIXES = (".bag", ".mcap", ".db3", "")
 
@@ -118,39 +116,6 @@ def test_colour_of_a_camera_that_is_fixed_beside_is_aligned(tmp_path: Path, fram
         assert (read.colour.sum(axis=2) > 0).mean() > 0.3
 
 
-COLOUR_FROM_DEPTH = se3.exp(np.array([0.01, -0.02, 0.03, 0.015, 0.001, -0.002]))
-
-
-class Rig(Recorder):
-    """Records fixed transforms too."""
-
-    def _fill(self, writer: Any, frames: list[Frame]) -> None:
-        ros1 = self.ros1 or isinstance(writer, rosbag1.Writer)
-        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-        if ros1:
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-        types, link_from_depth = store.types, se3.exp(np.array([0.5, 0.1, -0.3, 0.0, 0.02, 0.01]))
-        link_from_colour = link_from_depth @ se3.inverse(COLOUR_FROM_DEPTH)
-        extra = {"seq": 0} if ros1 else {}
-        stamped = []
-        for child, pose in (("depth", link_from_depth), ("colour", link_from_colour)):
-            quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
-            transform = types["geometry_msgs/msg/Transform"](
-                translation=types["geometry_msgs/msg/Vector3"](*map(float, pose[:3, 3])),
-                rotation=types["geometry_msgs/msg/Quaternion"](*map(float, quaternion)),
-            )
-            stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-            header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="link", **extra)
-            stamped.append(
-                types["geometry_msgs/msg/TransformStamped"](header=header, child_frame_id=child, transform=transform)
-            )
-        message = types["tf2_msgs/msg/TFMessage"](transforms=stamped)
-        connection = writer.add_connection("/tf_static", message.__msgtype__, typestore=store)
-        serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
-        writer.write(connection, START_NS, bytes(serialize(message, message.__msgtype__)))
-        super()._fill(writer, frames)
-
-
 def test_images_come_in_order_of_capture_each_once(tmp_path: Path, frames: list[Frame]) -> None:
     shuffled = [frames[place] for place in (1, 0, 0, 2)]
     shuffled[2] = dataclasses.replace(shuffled[2], index=9)
@@ -202,7 +167,6 @@ class RealSense(Recorder):
     """Records the sensor's option too."""
 
     def _fill(self, writer, frames):
-        from rosbags.typesys import Stores, get_typestore
 
         store = get_typestore(Stores.ROS1_NOETIC)
         unit = writer.add_connection(

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import small_frames, write_bundlesdf, write_tum
 
 from modeler.sequences import BopSequence, WatchLimits, open_sequence, watch, write_bop
 from modeler.types import Frame, InputError
+from studies.formats.image_folders import small_frames, write_bundlesdf, write_tum
 
 QUICK = WatchLimits(idle_s=1.0, settle_s=0.2, first=2)
 

@@ -11,8 +11,8 @@ import venv
 from pathlib import Path
 
 import pytest
-from commanded import FILES
-from sources import ROOT
+from command_runner import FILES
+from source_trees import ROOT
 
 LINUX_ONLY = ("sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "copy_file_range", "pipe2")
 """Functions of `os` that macOS lacks."""

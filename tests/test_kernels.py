@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import naive
+import naive_kernels
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -57,7 +57,7 @@ def test_paper_is_the_paper(noise, seed):
         (random_points(rng, 5), pose),
         (random_points(rng, 5), se3.inverse(pose)),
     ):
-        want = sum(np.log(naive.paper_density(point, motion, ranges_m, INTRINSICS, noise)) for point in points)
+        want = sum(np.log(naive_kernels.paper_density(point, motion, ranges_m, INTRINSICS, noise)) for point in points)
         got = paper.log_likelihoods(rows(motion[None]), points, ranges_m, INTRINSICS, noise, np.array([np.inf, 0.0]))
         # The twin takes Q by differences, good to about 1e-10.
         np.testing.assert_allclose(got[0], want, rtol=1e-9, atol=1e-8)
@@ -65,7 +65,7 @@ def test_paper_is_the_paper(noise, seed):
 
 def test_ray_jacobians_are_derivatives_and_inverses(rng):
     for point in random_points(rng, 20):
-        np.testing.assert_allclose(paper.ray_jacobian(point), naive.ray_jacobian(point), rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(paper.ray_jacobian(point), naive_kernels.ray_jacobian(point), rtol=1e-7, atol=1e-8)
         np.testing.assert_allclose(paper.ray_jacobian(point) @ paper.ray_jacobian_inverse(point), np.eye(3), atol=1e-12)
 
 
@@ -149,8 +149,8 @@ def test_visibility_is_within_its_bound_of_its_twin(seed):
     got = scores.scores(rows(poses), *projections, standing, parameters(0.006))
     want = [
         np.add(
-            naive.visibility(pose, projections[0], standing),
-            naive.visibility(se3.inverse(pose), projections[1], parameters(0.006)),
+            naive_kernels.visibility(pose, projections[0], standing),
+            naive_kernels.visibility(se3.inverse(pose), projections[1], parameters(0.006)),
         )
         for pose in poses
     ]
@@ -221,7 +221,7 @@ def test_local_planes_are_least_squares_in_inverse_depth(rng, noise_m):
     assert len(fitted) > 60
     np.testing.assert_array_equal(cells[..., planes.SILHOUETTE], edge_px)
     for pixel in fitted[::5]:
-        want = naive.local_plane(np.where(mask, depth_m, 0).astype(np.float32), mask, INTRINSICS, pixel, ball)
+        want = naive_kernels.local_plane(np.where(mask, depth_m, 0).astype(np.float32), mask, INTRINSICS, pixel, ball)
         got = -cells[(*pixel, slice(0, 3))] / cells[(*pixel, planes.DISTANCE)]
         np.testing.assert_allclose(got, want, rtol=2e-3, atol=2e-4)
 
@@ -262,7 +262,7 @@ def test_noise_as_large_as_the_ball_does_not_flatten_slopes(rng):
 def test_silhouette_distance_is_euclidean_within_the_chamfer_error(rng):
     mask = rng.random((40, 50)) < 0.004
     mask[20, 25] = True
-    got, want = planes.silhouette_distance(mask, 60.0), naive.silhouette_distance(mask)
+    got, want = planes.silhouette_distance(mask, 60.0), naive_kernels.silhouette_distance(mask)
     assert (np.abs(got - want) <= 0.09 * want + 1e-5).all()
     np.testing.assert_allclose(planes.silhouette_distance(mask, 3.0), np.minimum(got, 3.0), atol=1e-4)
 

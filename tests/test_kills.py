@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kills.commands import COMMANDS, CommandTrials, write_inputs
-from kills.trials import KINDS, SAME, Trials
 
 from modeler.cli import build, main
 from modeler.export import PairCache, Pairs, RunFolder, RunMeta, alone
@@ -24,6 +22,8 @@ from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar
 from modeler.sequences import bundled, open_sequence
 from modeler.types import AbstractPoseDensity, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
+from studies.kills.commands import COMMANDS, CommandTrials, write_inputs
+from studies.kills.trials import KINDS, SAME, Trials
 
 BOX = str(bundled("box"))
 QUICK = ("--prior", "table", "--method", "icp", "--frames", "0:3")

@@ -11,8 +11,8 @@ from typing import Any, cast
 
 import pytest
 import rerun.blueprint as rrb
+from rerun_recordings import read
 from rich.console import Console as Terminal
-from streamed import read
 
 from modeler.cli.console import Console
 from modeler.cli.live_advice import advising, summary_of

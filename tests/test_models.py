@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from commanded import Run
+from command_runner import Run
 
 from modeler import fusion, se3
 from modeler.experiment import Modelled, ModelScore, model_scores

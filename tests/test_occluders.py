@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bop_scenes import INDICES, META, random_frames
 from PIL import Image
-from recordings import write_open3d, write_tum
-from small_scene import INDICES, META, random_frames
+from segmentation_worlds import OBJECT, World, iou
 from test_visibility import flashlight  # noqa: F401  a fixture
-from worlds import OBJECT, World, iou
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg
@@ -26,6 +25,7 @@ from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import BopSequence, open_sequence, write_bop
 from modeler.types import BoolArray, Frame, InputError, Outcome
+from studies.formats.image_folders import write_open3d, write_tum
 
 
 def rod(frame: Frame, column: int) -> BoolArray:

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commanded import Run
-from made_up import META, made_up_steps
+from command_runner import Run
+from run_builders import META, made_up_steps
 
 from modeler.export import RunFolder
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from input_errors import refused
 from PIL import Image
-from refusal import refused
 from scipy.ndimage import map_coordinates
 from trimesh.visual.texture import TextureVisuals
 

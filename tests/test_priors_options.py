@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusal import refused
+from input_errors import refused
 
 from modeler.cli import main
 from modeler.cli.compose import chosen_prior, prior_name

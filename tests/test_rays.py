@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from calibration.specimens import load_specimen
-from calibration.study import Condition, rendered_views, staged
 
 from modeler import se3
 from modeler.evaluation import about_point, true_motion
@@ -12,6 +10,8 @@ from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Camera, Frame
+from studies.calibration.specimens import load_specimen
+from studies.calibration.study import Condition, rendered_views, staged
 
 CAMERA = Camera(width=320, height=480, fx=575.0, fy=575.0, cx=159.5, cy=239.5)
 AXIS_M, RADIUS_M, HALF_M = 0.8, 0.009, 0.12

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from calibration.specimens import load_specimen, recipe_names
-from refusal import refused
-from slow import sampled
+from input_errors import refused
+from slow_cases import sampled
 
 from modeler import se3
 from modeler.sequences.rendering.meshes import Mesh, outer_surface, ply_bytes
@@ -32,6 +31,7 @@ from modeler.sequences.rendering.shapes import (
 )
 from modeler.sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop, Turntable
 from modeler.types import InputError
+from studies.calibration.specimens import load_specimen, recipe_names
 
 
 @pytest.mark.parametrize("name", sampled(recipe_names(), every=12))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from naive import point_to_plane_equations
+from naive_kernels import point_to_plane_equations
 from scipy import ndimage
 
 from modeler import se3

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from calibration.specimens import load_specimen
 
 from modeler import se3
 from modeler.sequences import bundled, open_sequence
@@ -28,6 +27,7 @@ from modeler.sequences.rendering.renderer import RenderedSequence, render
 from modeler.sequences.rendering.shapes import AnyShape, Box, Compound, Part, Sphere
 from modeler.sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop
 from modeler.types import Camera, Frame, InputError
+from studies.calibration.specimens import load_specimen
 
 SMALL = Viewpoint(160, 120, 144.0)
 NAMES = ("box", "flashlight", "tube", "mug", "figurine", "two_fold", "l_bracket", "held")

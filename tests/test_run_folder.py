@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commanded import Run, runner
-from fuzz.special import replace_by
-from made_up import META, made_up_steps
+from command_runner import Run, runner
+from run_builders import META, made_up_steps
 
 from modeler import concurrency
 from modeler.export import (
@@ -28,6 +27,7 @@ from modeler.types import (
     InputError,
     Step,
 )
+from studies.fuzz.special import replace_by
 
 FILES = {"trajectory.txt", "odometry.txt", "graph.g2o", "report.json", "cloud.ply", "model.ply"}
 

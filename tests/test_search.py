@@ -4,10 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.by_camera import shown, viewed
-from calibration.depth_cameras import CAMERAS
-from calibration.specimens import load_specimen
-from calibration.study import Condition, rendered_views, staged
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
@@ -18,6 +14,10 @@ from modeler.registration.visibility.search import Candidates, Search
 from modeler.sequences import bundled, open_sequence
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Outcome
+from studies.calibration.by_camera import shown, viewed
+from studies.calibration.depth_cameras import CAMERAS
+from studies.calibration.specimens import load_specimen
+from studies.calibration.study import Condition, rendered_views, staged
 
 MIN_OVERLAP = VisibilityRegistrar().min_overlap
 WIDE = GeneralPrior(max_rotation_deg=95.0, max_offset_m=0.08)  # the other way round a box is beyond

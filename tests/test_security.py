@@ -10,13 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from commanded import BOX, QUICK
-from recordings import small_frames, small_truth, write_open3d
-from sources import SOURCES, nodes
+from command_runner import BOX, QUICK
+from source_trees import SOURCES, nodes
 
 import modeler
 from modeler.cli import main
 from modeler.sequences import open_sequence, write_bop
+from studies.formats.image_folders import small_frames, small_truth, write_open3d
 
 EVIL = "../../../../evil <script>alert(1)</script>"
 RUNS_CODE = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "torch", "yaml", "runpy", "code"}

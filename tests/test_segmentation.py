@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusal import refused
+from input_errors import refused
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from worlds import CAMERA, OBJECT, World, iou
+from segmentation_worlds import CAMERA, OBJECT, World, iou
 
 from modeler.segmentation import Scene, Segmenter
 from modeler.segmentation.depth_images import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sources import ROOT, SOURCES, nodes, tree
+from source_trees import ROOT, SOURCES, nodes, tree
 
 MAX_LINES = 500
 HOLDS_ARRAYS = re.compile(r"^(?!Callable).*(Array|ndarray)")

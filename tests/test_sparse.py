@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.specimens import load_specimen
-from calibration.study import Condition, staged
 from scipy.stats import chi2
 
 from modeler.evaluation import nees, rotation_error_deg, true_motion
@@ -19,6 +17,8 @@ from modeler.segmentation import Scene, Segmenter
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import Camera, Frame, Outcome, Step
+from studies.calibration.specimens import load_specimen
+from studies.calibration.study import Condition, staged
 
 SHAPE = (120, 160)
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)

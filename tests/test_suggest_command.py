@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from commanded import Run
-from refusal import refused
+from command_runner import Run
+from input_errors import refused
 
 from modeler.cli.candidate_file import read_candidates
 

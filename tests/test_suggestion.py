@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.specimens import load_specimen
 
 from modeler import se3
 from modeler.graph import PoseGraph, solve
@@ -22,6 +21,7 @@ from modeler.suggestion.edge_prediction import TURNS_RAD, basins
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
 from modeler.suggestion.surface_cells import enclosing_circle
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Stated
+from studies.calibration.specimens import load_specimen
 
 
 def edge(source: int, target: int, mean: Array, sigma_rad: float, rng: np.random.Generator) -> Edge:

@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 import pytest
-from closing import ABOUT_OBJECT, COVARIANCE, turned, view
+from closure_runs import ABOUT_OBJECT, COVARIANCE, turned, view
 from test_pipeline import FRAMES, Oracle, modeler, run, trajectory_error
 
 from modeler import se3

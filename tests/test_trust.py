@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
-from commanded import BOX, Run, runner
+from command_runner import BOX, Run, runner
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 SHUFFLED = [1, 10, 9, 5, 11, 2, 3, 7, 8, 4, 0, 12, 6, 13]

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration.specimens import load_specimen
-from trust.__main__ import run
-from trust.faults import FAULTS, late_mask, loose_mask, object_still, thin_mask, wrong_intrinsics, wrong_scale
-from trust.plan import HALVES, SOUND, Plan, shapes, sound, viewed
-from trust.stage import Recorded, Stage
-from trust.study import Outcome, pose_errors
-from trust.tables import text
 
 from modeler import se3
 from modeler.types import Camera, Frame, Solution, Step
+from studies.calibration.specimens import load_specimen
+from studies.trust.__main__ import run
+from studies.trust.faults import FAULTS, late_mask, loose_mask, object_still, thin_mask, wrong_intrinsics, wrong_scale
+from studies.trust.plan import HALVES, SOUND, Plan, shapes, sound, viewed
+from studies.trust.stage import Recorded, Stage
+from studies.trust.study import Outcome, pose_errors
+from studies.trust.tables import text
 
 RIGHT = Outcome(
     half="tuning",
@@ -173,9 +173,8 @@ def test_a_run_is_judged_and_the_same_again(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_runs_side_by_side_from_the_command_line(tmp_path: Path) -> None:
     """Workers are processes of their own: what they are sent must be found there."""
-    folder = Path(__file__).parent
-    environment = os.environ | {"PYTHONPATH": f"{folder}:{folder.parent}"}
-    command = [sys.executable, "-m", "trust", "--runs", "2", "--jobs", "2", "--out", str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    command = [sys.executable, "-m", "studies", "trust", "--runs", "2", "--jobs", "2", "--out", str(tmp_path)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     assert len((tmp_path / "tuning.jsonl").read_text().splitlines()) == 2

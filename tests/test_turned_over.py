@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import tabletop
 from scipy.spatial.transform import Rotation
-from trust.plan import coarser
 
 from modeler import se3
 from modeler.closure import Closer, MapView
@@ -46,6 +45,7 @@ from modeler.types import (
     segments,
 )
 from modeler.verdict.evidence import other_modes
+from studies.trust.plan import coarser
 
 LOPSIDED = Compound(
     (
@@ -167,7 +167,7 @@ def test_spans_stay_within_a_segment() -> None:
 
 
 def test_postures_of_the_study_rest_on_the_table() -> None:
-    from turned_over.plan import Plan
+    from studies.turned_over.plan import Plan
 
     stage = Plan("tuning", 0).stage()
     assert stage.recipe.turned_over is not None

@@ -16,8 +16,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun.chunk
 from PIL import Image
+from rerun_recordings import MERGED, Recording, drawn, read, record
 from scipy.spatial.transform import Rotation
-from streamed import MERGED, Recording, drawn, read, record
 from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, steps
 
 from modeler import se3

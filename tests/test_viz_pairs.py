@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import rerun.chunk
-from streamed import Recording, drawn
+from rerun_recordings import Recording, drawn
 from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, object_from_camera
 
 from modeler import se3

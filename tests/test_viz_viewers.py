@@ -21,7 +21,7 @@ from urllib.parse import unquote
 
 import pytest
 import rerun.chunk
-from streamed import read, record
+from rerun_recordings import read, record
 from turning_box import COUNT
 
 from modeler.types import Step

@@ -1,0 +1,1 @@
+"""Damaged inputs by the hundred thousand; `python -m studies fuzz` runs them."""

@@ -1,0 +1,1 @@
+"""Kills commands and gives them again; `python -m studies kills` does so at many moments."""

@@ -1,0 +1,125 @@
+"""Memory and time of `modeler build` over thousands of frames.
+
+`python -m studies loops.memory --frames 5000 --out runs/memory` renders an object that turns by 3° a frame, a
+folder of images that is reused, and builds it as the command does: with stored pairs, recording and report. With
+--told-truth, ground truth replaces registration, to measure the cost of everything else. Ctrl-C ends it with the frames
+so far. stdout has a line for every --every steps: resident memory as the system counts it (what the program
+allocated, and what it read of mapped files), and the most so far.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any, ClassVar
+
+from modeler.cli import build, compose, main
+from modeler.cli.console import Console
+from modeler.sequences import open_sequence, write_bop
+from modeler.types import Step
+from studies.loops.cases import turned
+from studies.loops.known import Known
+
+_FIELDS = ("RssAnon", "RssFile", "VmRSS", "VmHWM")
+
+
+def memory_mib() -> dict[str, float]:
+    """Return the resident memory of this process: allocated, of files, both, and the most of both so far."""
+    lines = (line.partition(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return {name: int(value.split()[0]) / 1024.0 for name, _, value in lines if name in _FIELDS}
+
+
+def write_sequence(folder: Path, frames: int, *, shape: str, width: int) -> None:
+    """Render frames at 3° each into a folder, one after the other."""
+    sequence = turned([3.0 * frame for frame in range(frames)], shape=shape, width=width)
+    sigma_wh, sigma_r_m, *_ = sequence.sensor() or (0.0, 0.0)
+    sensor = {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}
+    write_bop(folder, sequence, sequence.truth(), {"name": folder.name, "sensor": sensor})
+
+
+def write_repeated(folder: Path, pictures: Path, count: int, frames: int) -> None:
+    """Make a sequence of frames whose files are those of another of `count` frames, in turn."""
+    for part in (path for path in pictures.iterdir() if path.is_dir()):
+        (folder / part.name).mkdir(parents=True)
+        for frame in range(frames):
+            for path in part.glob(f"{frame % count:06d}*"):
+                os.link(path, folder / part.name / path.name.replace(f"{frame % count:06d}", f"{frame:06d}", 1))
+    for name in ("scene_camera.json", "scene_gt.json"):
+        entries = json.loads((pictures / name).read_text())
+        repeated = {str(frame): entries[str(frame % count)] for frame in range(frames)}
+        (folder / name).write_text(json.dumps(repeated))
+    described = json.loads((pictures / "sequence.json").read_text())
+    described["timestamps_s"] = {str(frame): frame / 30.0 for frame in range(frames)}
+    (folder / "sequence.json").write_text(json.dumps(described))
+
+
+class Meter(Console):
+    """The terminal's sink of steps, which also notes time and memory."""
+
+    every: ClassVar = 250
+    costs: ClassVar[list[dict[str, Any]]] = []
+
+    def __call__(self, event: Any) -> None:
+        """Note a step."""
+        super().__call__(event)
+        if not isinstance(event, Step):
+            return
+        now = {"s": time.monotonic(), "cpu_s": time.process_time(), "views": len(event.views)}
+        self.costs.append({**now, "edges": len(event.edges_so_far), "last": event.last, **memory_mib()})
+        if event.last or len(self.costs) % self.every == 0:
+            print(_row(self.costs, self.every), flush=True)
+
+
+def _row(costs: list[dict[str, Any]], every: int) -> str:
+    """Return a line on the newest step, with the time per frame since an earlier step."""
+    new, old = costs[-1], costs[max(len(costs) - 1 - every, 0)]
+    count = max(min(every, len(costs) - 1), 1)
+    spent = ((new[name] - old[name]) / count for name in ("s", "cpu_s"))
+    numbers = "  ".join(f"{new[name]:7.0f}" for name in _FIELDS)
+    step = "end" if new["last"] else str(len(costs))
+    return (
+        f"{step:>6}  {numbers} MiB   {new['edges']:6d} edges   " + "  ".join(f"{s:.3f}" for s in spent) + " s a frame"
+    )
+
+
+def run() -> int:
+    """Run the study and return the status of the command."""
+    parser = argparse.ArgumentParser(prog="python -m studies loops.memory", description=__doc__)
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument(
+        "--pictures", type=int, help="frames to render, whose files further frames share; whole turns are 120 each"
+    )
+    parser.add_argument("--every", type=int, default=250, help="steps between lines")
+    parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
+    parser.add_argument("--width", type=int, default=320, help="of the images in pixels, whose height is 3/4 of it")
+    parser.add_argument("--out", type=Path, default=Path("runs/memory"), help="folder of the sequence and the run")
+    parser.add_argument("--told-truth", action="store_true", help="register by the truth")
+    parser.add_argument("options", nargs="*", default=["--prior", "table"], help="of modeler build, after --")
+    options = parser.parse_args()
+    sequence = options.out / f"{options.shape}-{options.width}-{options.frames}"
+    count = min(options.pictures or options.frames, options.frames)
+    pictures = options.out / f"{options.shape}-{options.width}-{count}"
+    if not pictures.exists():
+        write_sequence(pictures, count, shape=options.shape, width=options.width)
+    if not sequence.exists():
+        write_repeated(sequence, pictures, count, options.frames)
+    Meter.every = options.every
+    build.Console = Meter
+    if options.told_truth:
+        truth = open_sequence(sequence).truth() or {}
+        compose.registrar = lambda *_, **__: Known(truth)
+    print("  step  " + "  ".join(f"{name:>7}" for name in _FIELDS) + "             edges      wall   processor")
+    kind = "-told" if options.told_truth else ""
+    run_folder = options.out / f"run-{options.width}-{options.frames}{kind}"
+    status = main(["build", str(sequence), "--out", str(run_folder), "--overwrite", *options.options])
+    (options.out / f"costs-{options.width}-{options.frames}{kind}.json").write_text(json.dumps(Meter.costs) + "\n")
+    print(f"status {status}; at the end of the program: {memory_mib()['VmHWM']:.0f} MiB at most")
+    return 0 if status in (0, 3) else status
+
+
+if __name__ == "__main__":
+    sys.exit(run())

@@ -1,0 +1,76 @@
+"""Build sequences without a fault and with one fault each, and count wrong models that end with 0: `make trust`.
+
+Shapes and draws are split into two halves: limits may be tuned on the tuning half; the other is for a single evaluation
+at the end. Every run is written as it ends (HALF.jsonl), and an interrupted study continues. The
+table goes to stdout, progress to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import numba
+
+from studies.results_file import earlier_results
+from studies.trust.plan import HALVES, Half, Plan
+from studies.trust.study import Outcome, outcome
+from studies.trust.tables import text
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m studies trust", description=__doc__)
+    parser.add_argument("--half", choices=HALVES, default="tuning", help="which shapes and draws")
+    parser.add_argument("--runs", type=int, default=150, metavar="N", help="of the half, every other one sound")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs side by side")
+    parser.add_argument("--out", type=Path, default=Path("runs/trust"), help="folder of the results")
+    options = parser.parse_args(arguments)
+    if options.runs < 1 or options.jobs < 1:
+        parser.error("--runs and --jobs take whole numbers from 1 on")
+    options.out.mkdir(parents=True, exist_ok=True)
+    outcomes = run(options.half, options.runs, options.jobs, options.out / f"{options.half}.jsonl")
+    print(text(outcomes))
+    return 0
+
+
+def run(half: Half, runs: int, jobs: int, path: Path) -> list[Outcome]:
+    """Build what has not been built yet, append it to a file, and return all outcomes by number."""
+    lines = earlier_results(path)
+    done = {one.number: one for one in (Outcome.of(json.loads(line)) for line in lines) if one.number < runs}
+    began = time.perf_counter()
+    with path.open("a") as stream:
+        for one in _outcomes([Plan(half, number) for number in range(runs) if number not in done], jobs):
+            done[one.number] = one
+            print(json.dumps(one.values()), file=stream, flush=True)
+            ended = f"{'wrong' if one.wrong else 'right'} with {one.status}"
+            print(
+                f"{len(done)} of {runs}: {one.number} {one.fault}, {one.shape}: {ended}, "
+                f"{time.perf_counter() - began:.0f} s",
+                file=sys.stderr,
+                flush=True,
+            )
+    return [done[number] for number in sorted(done)]
+
+
+def _outcomes(plans: Sequence[Plan], jobs: int) -> Iterator[Outcome]:
+    """Yield the outcomes of plans as they come; each run has one thread, to leave the cores to runs side by side."""
+    if jobs == 1:
+        numba.set_num_threads(1)
+        yield from map(outcome, plans)
+        return
+    context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
+    # A function of this module would not be found: workers do not import the `__main__` of a package.
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool:
+        for future in as_completed([pool.submit(outcome, plan) for plan in plans]):
+            yield future.result()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""Stands in for the process that builds a sequence: pairs that take no time, and a book of which were registered."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from modeler.cli.jobs import ENDED, Job, write_note
+from modeler.cli.one_job import begin, end_with_the_parent
+
+BOOK = "book.txt"
+"""Lines `name pair pid`, one a registration, in the folder of the batch."""
+
+
+PATIENCE_S = 60.0
+_STARTED = """
+import sys
+from modeler.cli import jobs, main
+jobs.BUILDER = "fake_builder"
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def sequence(folder: Path, *, pairs: int = 3, status: int = 0, pause_s: float = 0.0, fails: int = 0) -> Path:
+    """Make a sequence that ends with a status once it has failed so often.
+
+    Args:
+        folder: where.
+        pairs: how many it has.
+        status: how its build ends.
+        pause_s: how long a pair takes.
+        fails: how often the build is killed before.
+    """
+    folder.mkdir(parents=True)
+    told = {"pairs": pairs, "status": status, "pause_s": pause_s, "fails": fails}
+    (folder / "told.json").write_text(json.dumps(told))
+    return folder
+
+
+def book(out: Path) -> list[tuple[str, int]]:
+    """Return the registrations of a batch in order: name and pair."""
+    lines = (out / BOOK).read_text().splitlines() if (out / BOOK).exists() else []
+    return [(line.split()[0], int(line.split()[1])) for line in lines]
+
+
+def started(*arguments: object) -> subprocess.Popen[str]:
+    """Start a batch, whose builds this file stands in for, in a process of its own."""
+    command = [sys.executable, "-c", _STARTED, "batch", *map(str, arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """Return when a condition comes true."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def build(job: Job) -> int:
+    told = json.loads((Path(job.sequence) / "told.json").read_text())
+    (job.run / ".pairs").mkdir(parents=True, exist_ok=True)
+    for pair in range(told["pairs"]):
+        kept = job.run / ".pairs" / f"{pair}"
+        if kept.exists():
+            continue
+        with open(Path(job.out) / BOOK, "a") as lines:
+            lines.write(f"{job.name} {pair} {os.getpid()}\n")
+        time.sleep(told["pause_s"])
+        kept.touch()
+    failed = job.run / "failed"
+    failures = len(failed.read_text()) if failed.exists() else 0
+    if failures < told["fails"]:
+        failed.write_text("x" * (failures + 1))
+        os.abort()
+    if told["status"] in ENDED:
+        (job.run / "report.json").write_text("{}")
+    else:
+        print(f"modeler: {job.sequence}: cannot be built", file=sys.stderr)
+    return told["status"]
+
+
+def main() -> int:
+    threading.Thread(target=end_with_the_parent, daemon=True).start()
+    job, note = begin(sys.argv[1])
+    status = build(job)
+    if status in ENDED:
+        record = {"trustworthy": status == 0, "reasons": [] if status == 0 else ["made up"], "frames": 4}
+        write_note(job.note, {**note, "status": status, "record": record})
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Damaged inputs by the hundred thousand; `python -m fuzz` runs them."""

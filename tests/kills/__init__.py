@@ -1,1 +1,0 @@
-"""Kills commands and gives them again; `python -m kills` does so at many moments."""
