@@ -47,7 +47,6 @@ if TYPE_CHECKING:
         TurntablePrior,
         VelocityPrior,
     )
-    from modeler.rays import Sensor
     from modeler.registration import VisibilityRegistrar
     from modeler.segmentation import Segmenter
     from modeler.sequences import open_sequence
@@ -62,6 +61,7 @@ if TYPE_CHECKING:
         Solution,
         Step,
     )
+    from modeler.views import Sensor
 
 _MODULES = {
     "modeler.api": ("Result", "build", "register"),
@@ -77,7 +77,7 @@ _MODULES = {
         "TurntablePrior",
         "VelocityPrior",
     ),
-    "modeler.rays": ("Sensor",),
+    "modeler.views": ("Sensor",),
     "modeler.registration": ("VisibilityRegistrar",),
     "modeler.segmentation": ("Segmenter",),
     "modeler.types": (

@@ -18,11 +18,11 @@ from modeler.cli.outputs import check_run_folder
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.sequences import AbstractSequence
 from modeler.sequences import open_sequence as opened
 from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step
+from modeler.views import Sensor
 from modeler.viz.stream import open_stream
 
 Intrinsics = Camera | npt.ArrayLike

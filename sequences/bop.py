@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.regular_files import left_behind
 from modeler.sequences.base import AbstractSequence
 from modeler.sequences.image_files import (
     check_same_size,
@@ -34,6 +33,7 @@ from modeler.sequences.input_files import Node, entries, first_folder, frame_num
 from modeler.sequences.intrinsics import RANGE, Intrinsics, Overrides, of_matrix
 from modeler.sequences.recording import AbstractRecording
 from modeler.sequences.rendering.meshes import Mesh, read_mesh
+from modeler.system.regular_files import left_behind
 from modeler.types import Array, BoolArray, Camera, Frame, InputError
 
 

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from modeler.regular_files import open_regular, unreadable
 from modeler.sequences.input_files import entries
+from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import BoolArray, InputError
 
 MAX_PIXELS = 50_000_000

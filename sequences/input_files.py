@@ -16,7 +16,7 @@ from typing import final
 
 import numpy as np
 
-from modeler.regular_files import parse_json, read_regular
+from modeler.system.regular_files import parse_json, read_regular
 from modeler.types import Array, InputError
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.regular_files import check_regular
 from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour
 from modeler.sequences.input_files import Node, input_errors
 from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
 from modeler.sequences.lens import Alignment, Lens, coefficients
 from modeler.sequences.recording import AbstractStreams, paired
+from modeler.system.regular_files import check_regular
 from modeler.types import Array, Camera, InputError
 
 DEPTH, COLOUR = "CALIBRATION_CameraPurposeDepth", "CALIBRATION_CameraPurposePhotoVideo"

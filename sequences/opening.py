@@ -6,7 +6,6 @@ import contextlib
 import difflib
 from pathlib import Path
 
-from modeler.regular_files import check_regular
 from modeler.sequences.base import AbstractSequence
 from modeler.sequences.bop import BopSequence
 from modeler.sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
@@ -16,6 +15,7 @@ from modeler.sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, o
 from modeler.sequences.input_files import check_links, entries, is_there
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import SCHEME, open_camera
+from modeler.system.regular_files import check_regular
 from modeler.types import InputError
 
 FORMATS = (

@@ -17,9 +17,9 @@ import pytest
 from command_runner import QUICK, Run, runner
 from turning_box import COUNT, LOST, steps
 
-from modeler import concurrency
 from modeler.cli import main
 from modeler.sequences import bundled, write_bop
+from modeler.system import concurrency
 from modeler.types import Frame, Step
 from studies.formats.image_folders import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 

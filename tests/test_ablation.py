@@ -11,8 +11,8 @@ from slow_cases import sampled
 
 from modeler.evaluation import true_motion
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor
 from modeler.sequences import bundled, open_sequence
+from modeler.views import Sensor
 from studies.ablation.__main__ import registered
 from studies.ablation.pairs import Case
 from studies.ablation.tables import table

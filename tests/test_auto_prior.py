@@ -13,8 +13,8 @@ from modeler.graph import Smoother
 from modeler.pipeline.attempts import Search, predicted
 from modeler.pipeline.state import State
 from modeler.priors import AnyMotion, AutoPrior, GeneralPrior, TablePrior
-from modeler.rays import Sensor
 from modeler.types import PoseGaussian, Solution
+from modeler.views import Sensor
 
 
 def test_it_is_an_even_mixture_of_free_motion_and_motion_on_the_table(rng: np.random.Generator) -> None:

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from modeler import concurrency
-from modeler.concurrency import in_background, in_parallel, parallel_map, prefetching
+from modeler.system import concurrency
+from modeler.system.concurrency import in_background, in_parallel, parallel_map, prefetching
 
 
 @pytest.fixture(params=[1, 2])

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modeler.range_noise import range_noise
 from modeler.types import Frame
+from modeler.views.range_noise import range_noise
 from studies.calibration.by_camera import (
     CameraStudy,
     Trial,

@@ -22,7 +22,6 @@ from modeler.experiment import Pairing, Trial, evaluate, sparse_view, summaries
 from modeler.experiment.experiment import viewed
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -33,6 +32,7 @@ from modeler.types import (
     RayImage,
     Solution,
 )
+from modeler.views import Sensor
 from modeler.viz.figures import rotation_errors
 
 

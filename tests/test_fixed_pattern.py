@@ -12,10 +12,10 @@ from modeler import se3
 from modeler.evaluation import about_point, nees
 from modeler.kernels import point_to_plane
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.types import Posterior, RayImage
+from modeler.views import Sensor
 
 PATTERN = FixedPattern(share=0.6, area_px=40.0)
 WIDTH_PX, SIGMA_M = 3.0, 0.0025

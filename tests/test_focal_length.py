@@ -18,7 +18,6 @@ from modeler.graph import MovingGraph, PoseGraph, estimate_focal_length, solve
 from modeler.graph.focal import RELIEF_ERROR
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.focal_length import FocalNuisance
@@ -34,6 +33,7 @@ from modeler.types import (
     Solution,
     Step,
 )
+from modeler.views import Sensor
 
 
 def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:

@@ -14,7 +14,6 @@ from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 
 from modeler import se3
 from modeler.fusion import Fuser, IncrementalTsdf, meshing
-from modeler.rays import Sensor
 from modeler.sequences.bop import BopSequence
 from modeler.types import (
     Frame,
@@ -22,6 +21,7 @@ from modeler.types import (
     ObjectModel,
     RayImage,
 )
+from modeler.views import Sensor
 
 VOXEL_M = 0.0025
 FUSER = Fuser(voxel_m=VOXEL_M)

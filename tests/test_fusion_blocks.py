@@ -11,10 +11,10 @@ import pytest
 import tabletop
 from scipy.spatial import KDTree
 
-from modeler.disk_arrays import DiskArrays, ViewStore
 from modeler.fusion import Fuser, depth_views
 from modeler.fusion.exposure import _solved
 from modeler.fusion.fuser import downsampled, voxel_means
+from modeler.system.disk_arrays import DiskArrays, ViewStore
 
 VOXEL_M = 0.002
 BRICK = tabletop.Box((0.07, 0.05, 0.04))

@@ -13,12 +13,12 @@ from test_kernels import far_from_borders, parameters, random_pose, random_proje
 from modeler import se3
 from modeler.kernels import gpu, paper, scores
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.baselines.paper import FreeSpace, NumberedDraws, measured
 from modeler.se3 import rows
 from modeler.sequences import bundled
 from modeler.types import Plane, Posterior
+from modeler.views import Sensor
 
 with_warp = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
 BOX, POSES = tabletop.Box((0.05, 0.08, 0.035)), tabletop.turntable(24)[2:4]

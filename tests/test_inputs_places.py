@@ -19,8 +19,8 @@ import pytest
 from input_errors import refused
 
 from modeler.cli import main
-from modeler.regular_files import check_regular, create_regular, read_json, read_regular
 from modeler.sequences import open_sequence, write_bop
+from modeler.system.regular_files import check_regular, create_regular, read_json, read_regular
 from modeler.types import InputError
 from studies.formats.image_folders import small_frames, small_truth
 from studies.fuzz.special import SPECIAL, lengthen, remove, replace_by

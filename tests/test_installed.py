@@ -25,7 +25,7 @@ for name in {LINUX_ONLY}:
     if hasattr(os, name):
         delattr(os, name)
 import modeler
-from modeler.concurrency import cores, is_parallel
+from modeler.system.concurrency import cores, is_parallel
 os.environ.pop("NUMBA_NUM_THREADS", None)
 assert cores() == os.cpu_count()
 assert is_parallel() == (cores() > 1)

@@ -19,13 +19,13 @@ from modeler.cli.inputs import reopened
 from modeler.export import RunFolder, RunMeta, alone, pose_file
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
-from modeler.rays import Sensor
 from modeler.sequences import BopSequence, write_bop
 from modeler.sequences.rendering.recipe import Recipe, Table, Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
 from modeler.sequences.rendering.trajectory import Turntable
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, Stated, Step
+from modeler.views import Sensor
 from modeler.viz import entities
 from modeler.viz.report.run_data import cloud, recorded
 

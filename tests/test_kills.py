@@ -18,10 +18,10 @@ import pytest
 from modeler.cli import build, main
 from modeler.export import PairCache, Pairs, RunFolder, RunMeta, alone
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar
 from modeler.sequences import bundled, open_sequence
 from modeler.types import AbstractPoseDensity, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.views import Sensor
 from studies.kills.commands import COMMANDS, CommandTrials, write_inputs
 from studies.kills.trials import KINDS, SAME, Trials
 

@@ -18,10 +18,10 @@ from modeler.cli.console import Console
 from modeler.cli.live_advice import advising, summary_of
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
-from modeler.rays import Sensor
 from modeler.sequences import bundled, open_sequence
 from modeler.suggestion import Belief, Candidate, Suggestions, suggest
 from modeler.types import Failed, Outcome, Step
+from modeler.views import Sensor
 from modeler.viz import blueprint, next_view
 from modeler.viz.stream import open_stream
 

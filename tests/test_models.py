@@ -16,9 +16,9 @@ from command_runner import Run
 from modeler import fusion, se3
 from modeler.experiment import Modelled, ModelScore, model_scores
 from modeler.fusion import Fuser, Matcher
-from modeler.rays import Sensor
 from modeler.sequences import bundled, open_sequence, true_mesh
 from modeler.types import Array, InputError
+from modeler.views import Sensor
 
 BOX = bundled("box")
 FUSER = Fuser(voxel_m=0.003)

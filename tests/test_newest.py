@@ -13,11 +13,11 @@ import pytest
 from test_pipeline import FRAMES, modeler, trajectory_error
 
 from modeler.cli.console import Interrupt
-from modeler.disk_arrays import ViewStore
 from modeler.export import RunFolder
 from modeler.export.report import RunMeta
 from modeler.pipeline import NewestFrames
 from modeler.segmentation import Scene
+from modeler.system.disk_arrays import ViewStore
 from modeler.types import Frame, InputError, Step
 
 WAIT_S = 20.0  # never reached unless the test fails

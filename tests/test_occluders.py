@@ -19,12 +19,12 @@ from modeler.kernels.planes import KIND, RAGGED
 from modeler.kernels.point_likelihood import UNKNOWN
 from modeler.pipeline.pairs import prepare
 from modeler.priors import TablePrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import BopSequence, open_sequence, write_bop
 from modeler.types import BoolArray, Frame, InputError, Outcome
+from modeler.views import Sensor
 from studies.formats.image_folders import write_open3d, write_tum
 
 

@@ -14,7 +14,6 @@ from modeler.cli.options import MethodOptions
 from modeler.kernels import bands, gauss_newton, point_to_plane, scores
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility import photometric as colours
 from modeler.se3 import rows
@@ -23,6 +22,7 @@ from modeler.sequences.rendering.recipe import load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.types import Array, Camera, Frame, InputError, Outcome, Posterior, RayImage
+from modeler.views import Sensor
 
 TURN_DEG = 24.0
 Views = tuple[RayImage, RayImage]

@@ -19,7 +19,6 @@ from modeler.pipeline import Modeler, Prepared
 from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.state import State
 from modeler.priors.mixtures import DefensiveMixture, KernelMixture
-from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.types import (
     AbstractPoseDensity,
@@ -43,6 +42,7 @@ from modeler.types import (
     Step,
     explain,
 )
+from modeler.views import Sensor
 
 BOX = tabletop.Box((0.06, 0.045, 0.08))
 POSES = tabletop.turntable(9)

@@ -8,11 +8,11 @@ import tabletop
 from scipy.ndimage import gaussian_filter
 
 from modeler import se3
-from modeler.range_noise import range_noise
-from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood
 from modeler.segmentation import Segmenter
 from modeler.types import Camera, Frame
+from modeler.views import Sensor
+from modeler.views.range_noise import range_noise
 
 CAMERA = Camera(width=480, height=360, fx=500.0, fy=500.0, cx=239.5, cy=179.5)
 MASK = np.zeros((360, 480), dtype=bool)

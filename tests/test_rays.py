@@ -6,10 +6,10 @@ import pytest
 from modeler import se3
 from modeler.evaluation import about_point, true_motion
 from modeler.priors import TablePrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Camera, Frame
+from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, rendered_views, staged
 

@@ -10,7 +10,6 @@ from scipy import ndimage
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.kernels import point_to_plane
-from modeler.rays import Sensor
 from modeler.registration.posterior import weighted_gaussian
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.fixed_pattern import FixedPattern
@@ -19,6 +18,7 @@ from modeler.registration.visibility.refinement import Refiner, shrunk, visible_
 from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
 from modeler.sequences import bundled, open_sequence
+from modeler.views import Sensor
 
 
 def bundled_pair(name):

@@ -11,7 +11,6 @@ import tabletop
 
 from modeler import registration, se3
 from modeler.priors import GeneralPrior, PredictedProposal
-from modeler.rays import Sensor
 from modeler.types import (
     AbstractPoseDensity,
     AbstractRegistrar,
@@ -22,6 +21,7 @@ from modeler.types import (
     Posterior,
     RayImage,
 )
+from modeler.views import Sensor
 
 PRIOR = GeneralPrior(max_rotation_deg=25.0, max_offset_m=0.02)
 BODY = tabletop.Box((0.05, 0.08, 0.035))

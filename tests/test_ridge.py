@@ -11,7 +11,6 @@ import pytest
 from modeler import se3
 from modeler.evaluation import nees, true_motion
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility import ridge
 from modeler.registration.visibility.likelihood import PairLikelihood
@@ -22,6 +21,7 @@ from modeler.sequences.rendering.recipe import load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.types import Array, RayImage
+from modeler.views import Sensor
 
 BASIN: Final = np.repeat([0.2, 0.01], 3)
 

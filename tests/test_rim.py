@@ -13,7 +13,6 @@ from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.kernels import planes
 from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER_RIM, WEIGHT
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor, rim_weights
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.noise import nonnegative_solution, significant_variances
@@ -22,6 +21,7 @@ from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
 from modeler.sequences import bundled, open_sequence
 from modeler.types import Array, RayImage
+from modeler.views.rays import Sensor, rim_weights
 
 BLUR_M: Final = 0.001
 

@@ -16,13 +16,13 @@ import pytest
 from command_runner import Run, runner
 from run_builders import META, made_up_steps
 
-from modeler import concurrency
 from modeler.export import (
     RunFolder,
     RunMeta,
     report_of,
     write_atomically,
 )
+from modeler.system import concurrency
 from modeler.types import (
     InputError,
     Step,
@@ -145,7 +145,7 @@ def test_a_folder_that_takes_long_to_write_is_written_less_often(
         written.append(step.frame.index)
         return report_of(step, frames, meta)
 
-    monkeypatch.setattr("modeler.concurrency.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("modeler.system.concurrency.time.monotonic", lambda: now_s)
     monkeypatch.setattr("modeler.export.run_folder.report_of", slow)
     report = run.newest
     for step in steps:

@@ -8,12 +8,12 @@ import pytest
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor
 from modeler.registration.visibility import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.search import Candidates, Search
 from modeler.sequences import bundled, open_sequence
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Outcome
+from modeler.views import Sensor
 from studies.calibration.by_camera import shown, viewed
 from studies.calibration.depth_cameras import CAMERAS
 from studies.calibration.specimens import load_specimen

@@ -13,12 +13,12 @@ import tabletop
 
 from modeler import se3
 from modeler.cli import main
+from modeler.graph.self_calibration import FocalCalibrator
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor
-from modeler.self_calibration import FocalCalibrator
 from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
 from modeler.types import AbstractPrior, Edge, FocalLength, Outcome, Posterior, RayImage, Stated
+from modeler.views import Sensor
 
 STEPS = 12
 SENSOR = Sensor(sigma_r_m=1e-3, sigma_focal=0.02)

@@ -11,12 +11,12 @@ from modeler.fusion import Fuser
 from modeler.kernels import planes
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences.rendering.renderer import RenderedSequence
-from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import Camera, Frame, Outcome, Step
+from modeler.views import Sensor
+from modeler.views.sparsity import closed, gap_px, measured_share, nearest_depth
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, staged
 

@@ -11,7 +11,6 @@ from modeler import se3
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.priors import PokePrior, TablePrior
-from modeler.rays import Sensor
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.trajectory import Place, Places
@@ -21,6 +20,7 @@ from modeler.suggestion.edge_prediction import TURNS_RAD, basins
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
 from modeler.suggestion.surface_cells import enclosing_circle
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Stated
+from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen
 
 

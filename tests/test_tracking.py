@@ -18,7 +18,6 @@ from modeler.pipeline.attempts import unless_alike
 from modeler.pipeline.pairs import Registrations
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
-from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene
@@ -39,6 +38,7 @@ from modeler.types import (
     Step,
     pooled,
 )
+from modeler.views import Sensor
 
 TRUE_DEG, LIMIT_DEG = 25.0, 50.0
 

@@ -21,7 +21,6 @@ from modeler.pipeline import Modeler
 from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.state import State
 from modeler.priors import TablePrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Scene
 from modeler.sequences.rendering.depth_sensor import DepthSensor
@@ -45,6 +44,7 @@ from modeler.types import (
     segments,
 )
 from modeler.verdict.evidence import other_modes
+from modeler.views import Sensor
 from studies.trust.plan import coarser
 
 LOPSIDED = Compound(

@@ -12,10 +12,10 @@ import pytest
 import tabletop
 from test_pipeline import FRAMES, Oracle, modeler
 
-from modeler.disk_arrays import ViewStore
 from modeler.pipeline import Run
 from modeler.pipeline.state import State
 from modeler.segmentation import Scene
+from modeler.system.disk_arrays import ViewStore
 from modeler.types import RayImage, Step
 
 VIEW = tabletop.view(tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(1)[0], 0)

@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 
 from modeler import se3
-from modeler.rays import Sensor
 from modeler.types import (
     Array,
     BoolArray,
@@ -29,6 +28,7 @@ from modeler.types import (
     Stated,
     Step,
 )
+from modeler.views import Sensor
 
 COUNT, LOST = 6, 3
 """Frames of the run that tests share, and which of them is lost."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
-from modeler.regular_files import create_regular
+from modeler.system.regular_files import create_regular
 from modeler.types import InputError
 
 if TYPE_CHECKING:

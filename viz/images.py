@@ -14,9 +14,9 @@ from PIL import Image
 
 from modeler import se3
 from modeler.kernels import point_likelihood as kernel
-from modeler.rays import Sensor
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.types import Array, BoolArray, Frame, RayImage, Step
+from modeler.views import Sensor
 from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, Drawing, shown_posterior
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from PIL import Image
 
-from modeler.processes import environment
+from modeler.system.processes import environment
 from modeler.viz import entities
 
 FRAME_PATHS: Final = (

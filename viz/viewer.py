@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from modeler.regular_files import check_regular, open_regular
+from modeler.system.regular_files import check_regular, open_regular
 from modeler.types import InputError
 
 _HOST: Final = "127.0.0.1"

@@ -21,7 +21,6 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from modeler.address_space import check_room, share_one_heap
 from modeler.cli.batch import Batch
 from modeler.cli.build import Build
 from modeler.cli.calibrate_camera import CalibrateCamera
@@ -39,6 +38,7 @@ from modeler.cli.render import Render
 from modeler.cli.report import Report
 from modeler.cli.suggest import Suggest
 from modeler.cli.view import View
+from modeler.system.address_space import check_room, share_one_heap
 
 Command = (
     Build

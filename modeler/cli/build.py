@@ -79,8 +79,8 @@ class Build:
         from modeler.cli.advice import comes_back
         from modeler.cli.inputs import estimated_camera
         from modeler.cli.outputs import check_run_folder
-        from modeler.concurrency import in_parallel
         from modeler.export import PairCache, RunFolder, RunMeta, alone
+        from modeler.system.concurrency import in_parallel
         from modeler.viz.stream import load
 
         began_s = time.perf_counter()
@@ -207,7 +207,7 @@ def _run(
     """
     from modeler.cli.inputs import while_it_lasts
     from modeler.cli.live_advice import advising
-    from modeler.concurrency import in_background
+    from modeler.system.concurrency import in_background
     from modeler.types import Step
     from modeler.viz.stream import open_stream
 

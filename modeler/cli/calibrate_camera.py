@@ -51,7 +51,7 @@ class CalibrateCamera:
         from modeler.cli.inputs import reopened
         from modeler.cli.outputs import check_files, run_inputs
         from modeler.export import write_atomically
-        from modeler.self_calibration import FocalCalibrator
+        from modeler.graph.self_calibration import FocalCalibrator
         from modeler.sequences import FocalFactor
         from modeler.types import InputError
 

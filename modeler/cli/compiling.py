@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from modeler.cli.console import say
-from modeler.processes import environment
+from modeler.system.processes import environment
 
 if TYPE_CHECKING:
     from modeler.pipeline import Modeler

@@ -32,13 +32,13 @@ from modeler.priors import (
     VelocityPrior,
 )
 from modeler.priors.checks import ParameterError
-from modeler.rays import Sensor
 from modeler.registration.baselines import kiss
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.sequences import AbstractSequence
 from modeler.sequences.hand_shapes import hand_poses
 from modeler.sequences.input_files import frame_number
 from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError
+from modeler.views import Sensor
 
 _GIVEN = {
     "auto": (),

@@ -50,8 +50,8 @@ class Convert:
         """
         from modeler.cli.inputs import calibrated, reading, while_it_lasts
         from modeler.cli.outputs import check_files, check_folder, run_inputs
-        from modeler.regular_files import read_regular
         from modeler.sequences import frame_range, open_sequence, survey, write_bop
+        from modeler.system.regular_files import read_regular
         from modeler.types import InputError
 
         if (self.input / "report.json").is_file():

@@ -62,10 +62,10 @@ class DemoActive:
         from modeler.export import RunFolder, RunMeta
         from modeler.pipeline import Modeler
         from modeler.priors import TablePrior
-        from modeler.rays import Sensor
         from modeler.sequences.rendering.recipe import load_recipe
         from modeler.suggestion import Goal
         from modeler.types import InputError
+        from modeler.views import Sensor
         from modeler.viz.stream import open_stream
 
         if not (1 <= self.actions <= 100 and 0.0 < self.until_seen <= 1.0 and self.until_pose_deg > 0.0):

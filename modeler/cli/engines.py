@@ -15,8 +15,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar, final
 
-from modeler.concurrency import cores
-from modeler.processes import environment
+from modeler.system.concurrency import cores
+from modeler.system.processes import environment
 from modeler.types import InputError
 
 T = TypeVar("T")

@@ -39,7 +39,7 @@ class Gallery:
         from modeler.cli.models import TABLE, models_in, thumbnail_of
         from modeler.cli.outputs import check_files
         from modeler.export.models_table import blank, write_table
-        from modeler.regular_files import read_regular
+        from modeler.system.regular_files import read_regular
         from modeler.types import InputError
         from modeler.viz.gallery import write_gallery
 

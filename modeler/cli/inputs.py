@@ -18,7 +18,6 @@ from modeler.export import RunFolder, edges_of, poses_of
 from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
-from modeler.rays import Sensor
 from modeler.segmentation import Scene
 from modeler.sequences import (
     AbstractSequence,
@@ -33,6 +32,7 @@ from modeler.sequences import (
 )
 from modeler.sequences.base import AbstractDerived
 from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
+from modeler.views import Sensor
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
 _ALIKE = 0.02  # largest relative change of an object's number of points between versions of a library

@@ -20,7 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
-from modeler.processes import environment
+from modeler.system.processes import environment
 
 BUILDER = "modeler.cli.one_job"
 """Module that builds the sequence of a job, in a process of its own."""

@@ -12,7 +12,6 @@ import numpy as np
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.experiment.trials import Trial
 from modeler.pipeline import Registrations, prepare, without_limits
-from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.types import (
     AbstractPoseDensity,
@@ -29,6 +28,7 @@ from modeler.types import (
     Solution,
     Stated,
 )
+from modeler.views import Sensor
 
 _Seen = TypeVar("_Seen")
 _SPARSE_STREAM = 1  # the random stream that thins frame k is [seed, k, this]; pairs draw from [seed, source, target]

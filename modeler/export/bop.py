@@ -18,7 +18,7 @@ from modeler import se3
 from modeler.export.files import write_atomically
 from modeler.export.formats import ply_bytes
 from modeler.export.placing import Placement
-from modeler.regular_files import read_json
+from modeler.system.regular_files import read_json
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel
 
 MODELS_INFO = "models_info.json"

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from modeler.regular_files import left_behind
+from modeler.system.regular_files import left_behind
 from modeler.types import InputError
 
 PART = ".part"  # ending of a file that is still being written

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from modeler.export.files import write_atomically
 from modeler.export.standing import model_upright
-from modeler.regular_files import read_regular
+from modeler.system.regular_files import read_regular
 from modeler.types import ACCEPTED, Array, InputError, ObjectModel
 
 if TYPE_CHECKING:

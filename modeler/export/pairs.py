@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from modeler.export.files import settle_soon, write_atomically
-from modeler.regular_files import read_regular
+from modeler.system.regular_files import read_regular
 from modeler.types import (
     AbstractPairCache,
     AbstractPoseDensity,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from modeler import se3
-from modeler.regular_files import read_regular
+from modeler.system.regular_files import read_regular
 from modeler.types import Array, Edge, EdgeKind, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior, Stated
 
 Test = Callable[[Any], bool]

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from modeler.concurrency import Pace
 from modeler.export.files import PART, settle, settle_soon, write_atomically
 from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
 from modeler.export.pairs import Pairs
 from modeler.export.reading import fault
 from modeler.export.report import RunMeta, frame_record, report_of
-from modeler.regular_files import check_regular, read_json
+from modeler.system.concurrency import Pace
+from modeler.system.regular_files import check_regular, read_json
 from modeler.types import InputError, Step
 from modeler.verdict import FrameRecord
 

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from scipy.ndimage import binary_fill_holes, distance_transform_edt, maximum_filter, minimum_filter
 
 from modeler import se3
-from modeler.disk_arrays import DiskArrays, release
 from modeler.kernels import tsdf
 from modeler.kernels.point_clouds import fitted_planes
+from modeler.system.disk_arrays import DiskArrays, release
 from modeler.types import Array, BoolArray, Edge, InputError, RayImage, Solution
 
 GREY = 128  # colour of points that no view with colour sees

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.concurrency import in_parallel
 from modeler.fusion import meshing, watertight
 from modeler.fusion.depth_views import (
     SMOOTHED,
@@ -27,6 +26,7 @@ from modeler.fusion.distance_field import DistanceField, VoxelGrid, filled, grid
 from modeler.fusion.exposure import Exposure, exposure_of
 from modeler.fusion.support import ViewSupport, view_support
 from modeler.kernels import point_clouds
+from modeler.system.concurrency import in_parallel
 from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
 
 # Exponents of the view weights for colours: an average of views for vertices, nearly one view for textures, where an

@@ -10,7 +10,6 @@ from typing import TypeVar, final
 import numpy as np
 
 from modeler.closure import Closer, Placement
-from modeler.concurrency import prefetching
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise
 from modeler.pipeline.attempts import Stage
@@ -19,10 +18,10 @@ from modeler.pipeline.pairs import Prepared, Registrations, prepare, without_lim
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import GeneralPrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.suggestion import Belief, Candidate, Goal, Suggestions, suggest
+from modeler.system.concurrency import prefetching
 from modeler.types import (
     AbstractPairCache,
     AbstractPrior,
@@ -42,6 +41,7 @@ from modeler.types import (
     Solution,
     Step,
 )
+from modeler.views import Sensor
 
 _FOCAL_ROUNDS = 5  # registrations of the edges at most; eight captures take one to five
 _FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures are off by up to 4.5

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import final
 
-from modeler.disk_arrays import ViewStore
+from modeler.system.disk_arrays import ViewStore
 from modeler.types import Frame
 
 

@@ -8,7 +8,6 @@ from typing import final
 
 import numpy as np
 
-from modeler.rays import Sensor
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
     AbstractPairCache,
@@ -22,6 +21,7 @@ from modeler.types import (
     Reason,
     Segmentation,
 )
+from modeler.views import Sensor
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,11 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure import MapView, PathNetwork
-from modeler.disk_arrays import ViewStore
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
-from modeler.rays import Sensor
+from modeler.system.disk_arrays import ViewStore
 from modeler.types import Edge, FocalLength, InputError, PoseGaussian, Posterior, RayImage, Solution
+from modeler.views import Sensor
 
 _READY_BYTES, _MIN_READY = 128 * 2**20, 8  # of views whose images stay in memory: 13 of 640 × 480, at least 8
 _REVISITED = 3  # largest distance in frames between a lost frame and the later view against which it is retried

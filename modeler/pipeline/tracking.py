@@ -9,12 +9,11 @@ from threading import Lock
 from typing import final
 
 from modeler.closure import Closer, Placement
-from modeler.concurrency import parallel_map
 from modeler.pipeline.attempts import FULL, Attempt, Search, Stage
 from modeler.pipeline.pairs import Registrations
 from modeler.pipeline.state import State, newest_ready
-from modeler.rays import Sensor
 from modeler.registration.posterior import failed
+from modeler.system.concurrency import parallel_map
 from modeler.types import (
     AbstractPrior,
     Edge,
@@ -25,6 +24,7 @@ from modeler.types import (
     RayImage,
     Searching,
 )
+from modeler.views import Sensor
 
 
 @final

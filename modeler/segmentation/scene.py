@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from modeler.range_noise import RangeNoise
 from modeler.segmentation.background_colour import BackgroundColour
 from modeler.segmentation.depth_images import (
     HARDLY,
@@ -39,6 +38,7 @@ from modeler.segmentation.planes import (
     upright,
 )
 from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
+from modeler.views.range_noise import RangeNoise
 
 _CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall

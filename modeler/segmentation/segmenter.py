@@ -9,7 +9,6 @@ from typing import final
 import numpy as np
 from scipy import ndimage
 
-from modeler.range_noise import range_noise
 from modeler.segmentation.background_colour import BackgroundColour, without_background
 from modeler.segmentation.depth_images import (
     MOST,
@@ -23,8 +22,9 @@ from modeler.segmentation.depth_images import (
 from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, nearest_seen_m
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
-from modeler.sparsity import interpolated
 from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
+from modeler.views.range_noise import range_noise
+from modeler.views.sparsity import interpolated
 
 _NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover

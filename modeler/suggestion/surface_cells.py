@@ -19,8 +19,8 @@ from scipy.spatial import KDTree
 from modeler import se3
 from modeler.fusion.depth_views import free_of, window
 from modeler.kernels.occupancy import observation_counts
-from modeler.rays import Sensor
 from modeler.types import Array, BoolArray, Camera, RayImage, Solution
+from modeler.views import Sensor
 
 IntArray = npt.NDArray[np.intp]
 CELLS = 40  # across the object: cells of 2 to 3 mm on objects of 10 cm, as wide as the balls that smooth them

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.regular_files import read_regular
 from modeler.sequences.image_files import MAX_PIXELS
+from modeler.system.regular_files import read_regular
 from modeler.types import Array, BoolArray, InputError
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from modeler.regular_files import open_regular
 from modeler.sequences.input_files import check_link, entries, input_errors, read_text
+from modeler.system.regular_files import open_regular
 from modeler.types import InputError
 
 if sys.version_info >= (3, 14):

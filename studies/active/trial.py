@@ -16,12 +16,12 @@ from modeler.cli.simulated_robot import SimulatedRobot
 from modeler.pipeline import Modeler
 from modeler.pipeline.modeler import Run
 from modeler.priors import TablePrior
-from modeler.rays import Sensor
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.stage import Stage
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.pose_gain import edge_information
 from modeler.types import Array, Step
+from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen
 
 Policy = Literal["suggest", "random", "even"]

@@ -20,11 +20,11 @@ import numpy as np
 
 from modeler.kernels import gpu, scores
 from modeler.kernels.gpu.memory import forget
-from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.se3 import rows
 from modeler.sequences import bundled, open_sequence
 from modeler.types import RayImage
+from modeler.views import Sensor
 from studies.bench import speed
 
 CORES = 2

@@ -14,11 +14,11 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.kernels import scores
 from modeler.kernels.point_likelihood import Projection
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor
 from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import AbstractSequence, bundled, open_sequence
 from modeler.types import AbstractPrior, Array, Frame, Plane, RayImage
+from modeler.views import Sensor
 from studies.bench import reference
 
 SEQUENCES = ("box", "flashlight", "tube")

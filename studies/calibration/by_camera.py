@@ -29,11 +29,11 @@ from modeler import se3
 from modeler.evaluation import about_point, nees, rotation_error_deg, true_motion
 from modeler.export import write_atomically
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences.rendering.renderer import RenderedSequence, surroundings
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage
+from modeler.views import Sensor
 from studies.calibration.depth_cameras import CAMERAS, DepthCamera, World, placed
 from studies.calibration.specimens import SPECIMENS, Half, Specimen, load_specimen
 from studies.calibration.study import CONTROL, OURS, Condition, staged

@@ -12,13 +12,13 @@ from modeler import se3
 from modeler.evaluation import about_point, nees, rotation_error_deg, translation_error_m, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
-from modeler.rays import Sensor
 from modeler.registration import IcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.trajectory import Tabletop, Turntable
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Posterior, RayImage
+from modeler.views import Sensor
 from studies.calibration.specimens import FRAMES, SPECIMENS, Half, Specimen, Symmetry, load_specimen
 
 OURS, CONTROL = "visibility", "icp"

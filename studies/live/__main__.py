@@ -22,11 +22,11 @@ from modeler import se3
 from modeler.cli import compose
 from modeler.cli.build import DRAWING_SHARE
 from modeler.cli.options import MethodOptions, ObjectOptions
-from modeler.concurrency import in_background
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export import RunFolder, RunMeta
 from modeler.pipeline import NewestFrames
 from modeler.sequences.rendering.trajectory import Hand
+from modeler.system.concurrency import in_background
 from modeler.types import Frame, Step
 from modeler.viz.stream import open_stream
 from studies.in_hand.study import stage

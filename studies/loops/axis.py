@@ -20,12 +20,12 @@ from modeler.fusion import Fuser
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.priors import TurntablePrior
-from modeler.rays import Sensor
 from modeler.segmentation import Scene
 from modeler.sequences import AbstractSequence
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.trajectory import Turntable
 from modeler.types import Array, Solution, Step
+from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen
 from studies.loops.study import mean_nees
 

@@ -17,11 +17,11 @@ from modeler.fusion import Fuser
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.rays import Sensor
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import Array, Edge, PoseGaussian, Solution, Step
 from modeler.types.model import no_model
+from modeler.views import Sensor
 from studies.loops.cases import Case
 from studies.loops.known import Known
 from studies.loops.lies import Lying

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.graph import PoseGraph, dead_reckoning
-from modeler.regular_files import check_regular
+from modeler.system.regular_files import check_regular
 from modeler.types import Array, Edge, InputError, PoseGaussian
 from modeler.viz import entities
 from modeler.viz.reader import READ, steps_of

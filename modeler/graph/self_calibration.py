@@ -16,8 +16,8 @@ from typing import final
 from modeler.graph import MovingGraph, estimate_focal_length
 from modeler.graph.pose_graph import Factor, collapse_modes
 from modeler.priors.proposals import PredictedProposal
-from modeler.rays import Sensor
 from modeler.types import AbstractPrior, Edge, FocalLength, Posterior, RayImage
+from modeler.views import Sensor
 
 Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
 """Returns the posterior of target_from_source of a source and a target view under a prior."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler.kernels import planes
-from modeler.range_noise import RangeNoise
-from modeler.sparsity import closed, gap_px, measured_share, nearest_depth
 from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage
+from modeler.views.range_noise import RangeNoise
+from modeler.views.sparsity import closed, gap_px, measured_share, nearest_depth
 
 _ALIKE = 2.0  # areas of correlated noise that err alike: measured, see method.md
 _RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen to 1/e: measured, see method.md

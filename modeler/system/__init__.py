@@ -1,0 +1,1 @@
+"""The operating system: regular files, arrays on disk, threads, and the process's address space."""
