@@ -21,7 +21,7 @@ from modeler.priors import AutoPrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.sequences import AbstractSequence
 from modeler.sequences import open_sequence as opened
-from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step
+from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step, Verdict
 from modeler.views import Sensor
 from modeler.viz.stream import open_stream
 
@@ -38,15 +38,17 @@ class Result:
     """The fused object; None if no frame shows it."""
     solution: Solution
     """object_from_camera (4, 4) by frame number, with covariances."""
+    verdict: Verdict
+    """Whether the model can be trusted, why not, and the checks behind that."""
     report: Mapping[str, Any]
-    """As in report.json: every frame, every edge, and whether and why not to trust the model."""
+    """As in report.json: every frame, every edge, the verdict."""
     folder: Path
     """The run folder."""
 
     @property
     def trustworthy(self) -> bool:
-        """Whether the model can be trusted; `report["reasons"]` says why not."""
-        return bool(self.report["trustworthy"])
+        """Whether the model can be trusted; `verdict.reasons` says why not."""
+        return self.verdict.trustworthy
 
 
 def register(
@@ -138,9 +140,8 @@ def build(
         sequence=frames.name if isinstance(sequence, AbstractSequence) else str(sequence),
         seed=seed,
         prior=type(prior).__name__ if isinstance(prior, AbstractPrior) else compose.resolved_prior(options, frames)[0],
-        known=modeler.prior,
-        closure_expected=comes_back(frames, modeler.prior, modeler.closer.max_angle_deg),
     )
+    closure_expected = comes_back(frames, modeler.prior, modeler.closer.max_angle_deg)
     scene = compose.scene(modeler, frames)
     report: Mapping[str, Any] = {}
     last: Step | None = None
@@ -149,7 +150,7 @@ def build(
         facts = {"sequence": meta.sequence, "seed": seed, "prior": meta.prior}
         stream = open_stream(frames.name, save=folder.path / "recording.rrd", facts=facts)
         try:
-            for event in modeler.run(frames, scene):
+            for event in modeler.run(frames, scene, closure_expected=closure_expected):
                 if isinstance(event, Step):
                     seconds = {"total": time.perf_counter() - began_s}
                     report = folder.write(event, replace(meta, seconds=seconds))
@@ -158,9 +159,9 @@ def build(
         finally:
             stream.close()
         folder.finish()
-    if last is None:
+    if last is None or last.verdict is None:
         raise InputError(f"{frames.name}: has no selected frame; select others")
-    return Result(last.model, last.solution, report, folder.path)
+    return Result(last.model, last.solution, last.verdict, report, folder.path)
 
 
 def _camera(intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:

@@ -1,6 +1,7 @@
 """A run made up for tests of what runs leave on disk."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from modeler.types import (
     Edge,
     EdgeKind,
     Frame,
+    FrameRecord,
     ObjectModel,
     Outcome,
     PoseGaussian,
@@ -77,7 +79,17 @@ def made_up_steps(count: int = 4, *, closure: bool = True) -> list[Step]:
                 last=last,
             )
         )
-    return steps
+    return with_records(steps)
+
+
+def with_records(steps: Iterable[Step]) -> list[Step]:
+    """Return the steps of a run with the results of the frames before each."""
+    records: dict[int, FrameRecord] = {}
+    found = []
+    for step in steps:
+        records[step.frame.index] = step.record
+        found.append(replace(step, frames_so_far=tuple(records.values())))
+    return found
 
 
 def strict_json(text: str) -> Any:

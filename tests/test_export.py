@@ -32,7 +32,6 @@ from modeler.export import (
 from modeler.export.formats import cloud_ply, mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.export.reading import fault
-from modeler.export.run_folder import frame_record
 from modeler.export.standing import upright
 from modeler.types import (
     Array,
@@ -315,9 +314,7 @@ def _on(step: Step, up: Array) -> Step:
 
 
 def _report(step: Step) -> dict:
-    return report_of(
-        step, [frame_record(replace(step, view=view, frame=view.frame)) for view in step.views.values()], META
-    )
+    return report_of(step, META)
 
 
 def _tower(up: Array) -> ObjectModel:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from ring_graphs import OBJECT_M, edge, measured, ring, spin, turntable
-from run_builders import META, made_up_steps, strict_json
+from run_builders import META, made_up_steps, strict_json, with_records
 
 from modeler import se3
 from modeler.export import (
     RunFolder,
-    RunMeta,
     edge_record,
     edges_of,
     g2o_text,
@@ -38,6 +37,7 @@ from modeler.types import (
     Step,
     explain,
 )
+from modeler.verdict import judged
 
 
 def test_report_has_the_promised_schema(tmp_path: Path) -> None:
@@ -68,19 +68,17 @@ def test_report_has_the_promised_schema(tmp_path: Path) -> None:
     assert (report["complete"], report["closed"], report["trustworthy"], report["reasons"]) == (True, True, True, [])
 
 
-def _spoilt(change: Callable[[Step], Step], meta: RunMeta, path: Path) -> dict[str, Any]:
+def _spoilt(change: Callable[[Step], Step], path: Path, *, closure: bool = True) -> dict[str, Any]:
     run = RunFolder.open(path, overwrite=True)
-    return [run.write(change(step), meta) for step in made_up_steps(closure=meta.closure_expected is False)][-1]
+    return [run.write(step, META) for step in with_records(map(change, made_up_steps(closure=closure)))][-1]
 
 
 def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
     lost = "no overlap: The views share too little surface"
-    report = _spoilt(
-        lambda step: replace(step, left_out=Stated(lost)) if step.frame.index == 7 else step, META, tmp_path
-    )
+    report = _spoilt(lambda step: replace(step, left_out=Stated(lost)) if step.frame.index == 7 else step, tmp_path)
     assert (report["trustworthy"], report["reasons"]) == (False, [f"frame 7 was left out: {lost}"])
 
-    report = _spoilt(lambda step: step, replace(META, closure_expected=True), tmp_path)
+    report = _spoilt(lambda step: replace(step, verdict=judged(step, closure_expected=True)), tmp_path, closure=False)
     assert (report["trustworthy"], report["closed"]) == (False, False)
     assert "no loop was closed" in report["reasons"][0]
 
@@ -90,14 +88,14 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
         ]
         return replace(step, edges_so_far=tuple(edges))
 
-    report = _spoilt(refuse, META, tmp_path)
+    report = _spoilt(refuse, tmp_path)
     assert report["reasons"] == ["none of 1 closures closed a loop; the last rejected one, frame 9 on frame 3: it lies"]
 
     def break_off(step: Step) -> Step:  # 5 -> 7 falls, so that the closure 9 -> 3 is all that holds the rest
         edges = [replace(edge, accepted=(edge.source, edge.target) != (7, 5)) for edge in step.edges_so_far]
         return replace(step, edges_so_far=tuple(edges))
 
-    report = _spoilt(break_off, META, tmp_path)
+    report = _spoilt(break_off, tmp_path)
     assert report["closed"] is False
     assert report["reasons"] == ["the edge between the first frames and the last is unconfirmed: no loop was closed"]
 
@@ -105,10 +103,9 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
         edges = [replace(edge, posterior=replace(edge.posterior, overlap=0.45)) for edge in step.edges_so_far]
         return replace(step, edges_so_far=tuple(edges))
 
-    report = _spoilt(see_little, META, tmp_path)  # no edge of a loop stands alone
+    report = _spoilt(see_little, tmp_path)  # no edge of a loop stands alone
     assert report["reasons"] == []
-    run, chain = RunFolder.open(tmp_path, overwrite=True), replace(META, closure_expected=False)
-    report = [run.write(see_little(step), chain) for step in made_up_steps(closure=False)][-1]
+    report = _spoilt(see_little, tmp_path, closure=False)
     assert [reason.partition(" share")[0] for reason in report["reasons"]] == [
         f"frames {frame} and {frame - 2}" for frame in (5, 7, 9)
     ]
@@ -117,7 +114,7 @@ def test_report_says_why_a_model_is_not_to_be_trusted(tmp_path: Path) -> None:
         outliers = tuple(edge for edge in step.edges_so_far if edge.kind == "closure")
         return replace(step, solution=replace(step.solution, outliers=outliers))
 
-    report = _spoilt(leave_out, META, tmp_path)
+    report = _spoilt(leave_out, tmp_path)
     assert report["closed"] is False
     assert report["edges"][-1]["accepted"] is False
     assert "contradict" in report["edges"][-1]["reason"]
@@ -138,8 +135,8 @@ def test_report_doubts_a_model_some_of_whose_frames_may_be_turned(tmp_path: Path
 
         return change
 
-    assert _spoilt(vague(), META, tmp_path)["reasons"] == []
-    one, some = (_spoilt(vague(*frames), META, tmp_path) for frames in ((7,), (5, 7, 9)))
+    assert _spoilt(vague(), tmp_path)["reasons"] == []
+    one, some = (_spoilt(vague(*frames), tmp_path) for frames in ((7,), (5, 7, 9)))
     assert (one["closed"], one["trustworthy"]) == (True, False)
     assert one["reasons"] == ["the rotation of frame 7 is uncertain by 9.0° (one standard deviation)"]
     assert some["reasons"][0].endswith("(one standard deviation), 2 more by over 1.5°")

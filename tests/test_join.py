@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,7 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
         edges.append(Edge(Posterior(after, before, pose, Outcome.CONVERGED, overlap=0.9), kind, True, Stated("true")))
     solution = solve(PoseGraph(tuple(edges), first=0), {})
     folder = RunFolder.open(path)
-    meta = RunMeta(sequence=str(scene), seed=0, prior="turntable")
+    meta, records = RunMeta(sequence=str(scene), seed=0, prior="turntable"), []
     for k, view in views.items():
         last = k == max(views)
         assert view.frame.mask is not None
@@ -85,7 +86,8 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
             views=views,
             last=last,
         )
-        folder.write(step, meta)
+        records.append(step.record)
+        folder.write(replace(step, frames_so_far=tuple(records)), meta)
 
 
 @pytest.fixture(scope="module")

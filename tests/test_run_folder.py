@@ -27,6 +27,7 @@ from modeler.types import (
     InputError,
     Step,
 )
+from modeler.verdict import judged
 from studies.fuzz.special import replace_by
 
 FILES = {"trajectory.txt", "odometry.txt", "graph.g2o", "report.json", "cloud.ply", "model.ply"}
@@ -125,7 +126,8 @@ def test_run_has_finished_when_its_registrations_are_forgotten(tmp_path: Path) -
     run.finish()
     assert run.finished(META)
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"recording.rrd"}
-    run.write(made_up_steps(2)[-1], replace(META, interrupted=True))
+    step = made_up_steps(2)[-1]
+    run.write(replace(step, verdict=judged(step, interrupted=True)), META)
     run.pairs.keep(made_up_steps(2)[-1].edges_so_far[0].posterior, "question")
     run.finish()
     assert not run.finished(META)
@@ -139,11 +141,11 @@ def test_a_folder_that_takes_long_to_write_is_written_less_often(
     now_s, written = 0.0, []
     run, steps = RunFolder.open(tmp_path), made_up_steps(40)
 
-    def slow(step: Step, frames: list, meta: RunMeta) -> dict:
+    def slow(step: Step, meta: RunMeta) -> dict:
         nonlocal now_s
         now_s += 2.0
         written.append(step.frame.index)
-        return report_of(step, frames, meta)
+        return report_of(step, meta)
 
     monkeypatch.setattr("modeler.system.concurrency.time.monotonic", lambda: now_s)
     monkeypatch.setattr("modeler.export.run_folder.report_of", slow)

@@ -1,4 +1,4 @@
-"""The verdict on a model: every figure of the evidence speaks against wrong models, and not against right ones."""
+"""The verdict on a model: every check speaks against wrong models, and not against right ones."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,6 +22,7 @@ from modeler.types import (
     Failed,
     FocalLength,
     Frame,
+    FrameRecord,
     HandPoses,
     LowOverlap,
     Mode,
@@ -37,18 +38,18 @@ from modeler.types import (
     Step,
     loop_openings,
 )
-from modeler.verdict import FrameRecord, judged
+from modeler.verdict import judged
 from modeler.verdict.evidence import (
     contradiction,
     displacement,
     free_space,
-    graph_figure,
-    loop_figure,
+    graph_check,
+    loop_check,
     misfit,
     one_axis_sd,
     other_modes,
+    prior_check,
     prior_distances,
-    prior_figure,
     spread_of_positions,
     spread_of_rotations,
 )
@@ -188,7 +189,7 @@ def test_pairs_are_compared_with_their_prior(prior: AbstractPrior, found_deg: fl
     poses = poses_of([0.0, -found_deg])  # turned left-handed about y, which points down: right-handed about up
     against = contradiction(prior_distances([joined(1, 0, poses)], views, prior))
     assert against is not None
-    assert against.figure.holds is not contradicted
+    assert against.check.holds is not contradicted
     assert (against.source, against.target) == (1, 0)
 
 
@@ -204,11 +205,11 @@ def test_one_new_grasp_contradicts_no_hand_and_one_at_every_step_does(changes: i
     distances = prior_distances(
         [joined(k, k - 1, poses) for k in range(1, 13)], views, HeldPrior(HandPoses(np.arange(13.0), np.stack(hands)))
     )
-    against, figure = contradiction(distances), prior_figure(distances)
+    against, check = contradiction(distances), prior_check(distances)
     assert against is not None
-    assert figure is not None
-    assert against.figure.holds
-    assert figure.holds is together
+    assert check is not None
+    assert against.check.holds
+    assert check.holds is together
 
 
 def test_a_tilted_object_contradicts_its_table() -> None:
@@ -220,7 +221,7 @@ def test_a_tilted_object_contradicts_its_table() -> None:
         poses = {0: np.eye(4), 1: se3.inverse(motion)}
         against = contradiction(prior_distances([joined(1, 0, poses)], views, TablePrior()))
         assert against is not None
-        assert against.figure.holds is holds
+        assert against.check.holds is holds
 
 
 @pytest.mark.parametrize(("step_deg", "alone", "together"), [(25.3, True, True), (28.5, True, False)])
@@ -229,12 +230,12 @@ def test_a_step_told_wrongly_shows_in_all_pairs_together(step_deg: float, alone:
     views, poses = views_of(angles_deg), poses_of(angles_deg)
     edges = [joined(k, k - 1, poses) for k in range(1, 13)]
     distances = prior_distances(edges, views, TurntablePrior(25.0))
-    against, figure = contradiction(distances), prior_figure(distances)
+    against, check = contradiction(distances), prior_check(distances)
     assert against is not None
-    assert figure is not None
-    assert against.figure.holds is alone
-    assert figure.holds is together
-    assert prior_figure(prior_distances([joined(5, 1, poses, kind="closure")], views, TurntablePrior(25.0))) is None
+    assert check is not None
+    assert against.check.holds is alone
+    assert check.holds is together
+    assert prior_check(prior_distances([joined(5, 1, poses, kind="closure")], views, TurntablePrior(25.0))) is None
 
 
 def ring(off_deg: float, *, count: int = 15) -> tuple[list[Edge], Solution]:
@@ -250,18 +251,18 @@ def test_loops_open_by_more_than_their_edges_state_speak_against_a_model() -> No
     """Fifteen edges of 0.3° each: a loop is uncertain by 1.2°."""
     for off_deg, holds in ((0.0, True), (2.0, True), (8.0, False)):
         edges, solution = ring(off_deg)
-        worst = loop_figure(loop_openings(edges, solution, {}))
+        worst = loop_check(loop_openings(edges, solution, {}))
         assert worst is not None
-        opening, figure = worst
-        assert figure.holds is holds
+        opening, check = worst
+        assert check.holds is holds
         assert np.degrees(opening.rotation_rad) == pytest.approx(off_deg, abs=1e-6)
-    assert loop_figure(loop_openings(edges[:-1], solution, {})) is None
+    assert loop_check(loop_openings(edges[:-1], solution, {})) is None
 
 
 def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
     edges, solution = ring(2.0)
     openings = loop_openings(edges, solution, {})
-    one, many = loop_figure(openings), loop_figure(openings * 50)
+    one, many = loop_check(openings), loop_check(openings * 50)
     assert one is not None
     assert many is not None
     assert one[1].limit == pytest.approx(np.sqrt(22.458 / 6.0), rel=1e-3)  # χ² of 6 degrees of freedom, 0.001
@@ -270,18 +271,18 @@ def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
 
 def test_edges_that_contradict_each_other_speak_against_a_model() -> None:
     edges, solution = ring(0.0)
-    figure = graph_figure(edges, solution)
-    assert figure is not None
-    assert figure.holds
+    check = graph_check(edges, solution)
+    assert check is not None
+    assert check.holds
     wrong = poses_of([0.0, 20.0])[1]
     spoilt = replace(edges[3].posterior, pose=replace(edges[3].posterior.pose, mean=wrong))
     spoilt_edges = [*edges[:3], replace(edges[3], posterior=spoilt), *edges[4:]]
-    figure = graph_figure(spoilt_edges, solution)
-    assert figure is not None
-    assert not figure.holds
-    assert misfit(spoilt_edges, solution) == pytest.approx(np.sqrt(figure.value))
+    check = graph_check(spoilt_edges, solution)
+    assert check is not None
+    assert not check.holds
+    assert misfit(spoilt_edges, solution) == pytest.approx(np.sqrt(check.value))
     assert misfit(edges, solution) >= 1.0
-    assert graph_figure(edges[:-1], solution) is None  # a tree contradicts nothing
+    assert graph_check(edges[:-1], solution) is None  # a tree contradicts nothing
     assert misfit(edges[:-1], solution) == 1.0
 
 
@@ -293,9 +294,9 @@ def test_modes_that_the_graph_leaves_open_speak_against_a_model() -> None:
     edge = joined(1, 0, poses, modes=modes)
     for weights, holds in (((0.5, 0.49, 0.01), True), ((0.5, 0.3, 0.2), False)):
         solution = Solution(poses, mode_weights={(1, 0): np.array(weights)})
-        figure = other_modes([edge], solution, views)
-        assert figure.holds is holds
-        assert figure.value == pytest.approx(weights[2])
+        check = other_modes([edge], solution, views)
+        assert check.holds is holds
+        assert check.value == pytest.approx(weights[2])
     assert other_modes([edge], Solution(poses), views).value == 0.0
 
 
@@ -313,14 +314,14 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
         turn, place = spread_of_rotations(solution), spread_of_positions(views, solution)
         assert turn is not None
         assert place is not None
-        assert (turn.frame, turn.figure.holds) == (2, turn_holds)
-        assert (place.frame, place.figure.holds) == (2, place_holds)
-        assert place.figure.value == pytest.approx(np.hypot(sigma_m, 0.0005), rel=0.02)
-        drawn_deg = np.abs(turn.figure.value * rng.normal(size=20_000))
+        assert (turn.frame, turn.check.holds) == (2, turn_holds)
+        assert (place.frame, place.check.holds) == (2, place_holds)
+        assert place.check.value == pytest.approx(np.hypot(sigma_m, 0.0005), rel=0.02)
+        drawn_deg = np.abs(turn.check.value * rng.normal(size=20_000))
         assert bool(np.mean(drawn_deg > 3.0) < 0.05) is turn_holds
     wider = spread_of_rotations(solution, 2.0)
     assert wider is not None
-    assert 1.9 < wider.figure.value / turn.figure.value < 2.2
+    assert 1.9 < wider.check.value / turn.check.value < 2.2
     assert spread_of_rotations(Solution()) is None
     assert spread_of_positions(views, Solution()) is None
 
@@ -371,11 +372,12 @@ def whole_run(
         solution=solve(PoseGraph(edges=edges, first=0), {}, focal=focal),
         edges_so_far=edges,
         views=views,
+        frames_so_far=tuple(frames),
         last=last,
     )
-    verdict = judged(step, frames, prior=prior, closure_expected=expected, depth_scale_sigma=depth_scale_sigma)
-    assert verdict.trustworthy == (not verdict.shortcomings)
-    return [found.code for found in verdict.shortcomings], {name: fig.holds for name, fig in verdict.evidence.items()}
+    verdict = judged(step, prior=prior, closure_expected=expected, depth_scale_sigma=depth_scale_sigma)
+    assert verdict.trustworthy == (not verdict.reasons)
+    return list(verdict.codes), {name: check.holds for name, check in verdict.checks.items()}
 
 
 @pytest.mark.parametrize(("sigma", "codes"), [(0.0, []), (0.005, []), (0.03, ["unsure_focal"])])
@@ -472,10 +474,12 @@ def test_two_segments_need_two_pairs_that_join_them_and_what_is_between_them_cou
             solution=solve(PoseGraph(edges=edges, first=0), {}),
             edges_so_far=edges,
             views=views,
+            frames_so_far=(
+                *(FrameRecord(k, float(k), 100, "accepted") for k in numbers),
+                FrameRecord(lost, float(lost), 0, "a hand", cause="no overlap"),
+            ),
             last=True,
         )
-        frames = [FrameRecord(k, float(k), 100, "accepted") for k in numbers]
-        frames.append(FrameRecord(lost, float(lost), 0, "a hand", cause="no overlap"))
         # Steps of 25° where the motion was known, and none of the joins is one.
-        verdict = judged(step, frames, prior=TurntablePrior(-25.0, axis_direction=UP))
-        assert {found.code for found in verdict.shortcomings} == expected
+        verdict = judged(step, prior=TurntablePrior(-25.0, axis_direction=UP))
+        assert {*verdict.codes} == expected

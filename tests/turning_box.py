@@ -18,6 +18,7 @@ from modeler.types import (
     EdgeKind,
     Failed,
     Frame,
+    FrameRecord,
     ObjectModel,
     Outcome,
     PoseGaussian,
@@ -46,6 +47,7 @@ def steps(count: int = 5, *, width: int = 96, lost: int | None = None, colour: b
     rng = np.random.default_rng(3)
     views: dict[int, RayImage] = {}
     edges: list[Edge] = []
+    records: list[FrameRecord] = []
     chain: dict[int, Array] = {}
     covariances: dict[int, Array] = {}
     for index in range(count):
@@ -60,7 +62,7 @@ def steps(count: int = 5, *, width: int = 96, lost: int | None = None, colour: b
         edges += judged
         trajectory = {k: object_from_camera(k) for k in chain}
         found = index != lost
-        yield Step(
+        step = Step(
             frame=frame,
             segmentation=Segmentation(mask, None, Outcome.CONVERGED),
             view=view,
@@ -73,6 +75,8 @@ def steps(count: int = 5, *, width: int = 96, lost: int | None = None, colour: b
             views=dict(views),
             last=last,
         )
+        records.append(step.record)
+        yield replace(step, frames_so_far=tuple(records))
 
 
 def object_from_camera(index: int) -> Array:

@@ -76,7 +76,6 @@ class Build:
             InputError: if the input or the folder cannot be used.
         """
         from modeler.cli import compose
-        from modeler.cli.advice import comes_back
         from modeler.cli.inputs import estimated_camera
         from modeler.cli.outputs import check_run_folder
         from modeler.export import PairCache, RunFolder, RunMeta, alone
@@ -95,9 +94,7 @@ class Build:
             sequence=str(self.sequence),
             seed=self.method.seed,
             prior=prior,
-            known=modeler.prior,
             settings=self.settings(),
-            closure_expected=comes_back(frames, modeler.prior, modeler.closer.max_angle_deg),
             camera=estimated_camera(self.model.camera),
         )
         if self.resume and RunFolder(self.out).finished(meta):
@@ -205,6 +202,7 @@ def _run(
         InputError: if a frame cannot be read or a file cannot be written.
         KeyboardInterrupt: if the user interrupted before the first frame.
     """
+    from modeler.cli.advice import comes_back
     from modeler.cli.inputs import while_it_lasts
     from modeler.cli.live_advice import advising
     from modeler.system.concurrency import in_background
@@ -221,7 +219,11 @@ def _run(
         facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
         advised=frames.live,
     )
-    run = modeler.start(scene)
+    run = modeler.start(
+        scene,
+        closure_expected=comes_back(frames, modeler.prior, modeler.closer.max_angle_deg),
+        depth_scale_sigma=0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"]),
+    )
     seconds = {"scene": time.perf_counter() - began_s, "registration": 0.0, "total": 0.0}
     report: Mapping[str, Any] = {}
     try:
@@ -240,7 +242,7 @@ def _run(
                 if isinstance(event, Step):
                     seconds["registration"] += sum(posterior.seconds for posterior in event.posteriors)
                     seconds["total"] = time.perf_counter() - began_s
-                    meta = replace(meta, seconds=dict(seconds), interrupted=interrupt.ended_early)
+                    meta = replace(meta, seconds=dict(seconds))
                     report = folder.write(event, meta)
                     # Computed here, before the next frame: the time of the first request decides the linearisation
                     # point of later ones, and so their last digits.
@@ -273,7 +275,7 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt, *, live: bo
         yield event
         if interrupt.asked:
             break
-    yield from run.finish()
+    yield from run.finish(interrupted=interrupt.ended_early)
 
 
 def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:

@@ -90,7 +90,7 @@ class DemoActive:
         )
         goal = Goal(self.until_pose_deg, self.until_seen)
         try:
-            demo = _Demo(modeler, folder, replace(meta, known=modeler.prior), stream, goal)
+            demo = _Demo(modeler, folder, meta, stream, goal)
             report, reached = demo.run(recipe, self.actions, np.random.default_rng([self.seed, 1]))
         finally:
             stream.close()

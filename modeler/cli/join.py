@@ -166,15 +166,19 @@ def _written(
     import numpy as np
 
     from modeler.fusion import Fuser, conditional_covariances
-    from modeler.types import Solution
-    from modeler.verdict import FrameRecord
+    from modeler.types import FrameRecord, Solution
+    from modeler.verdict import judged
     from modeler.viz.stream import open_stream
 
     views = dict(parts[0].views) | dict(parts[1].views)
     model = Fuser().fuse(views, solution.trajectory, conditional_covariances(solution, graph.edges))
     names = [field.name for field in fields(FrameRecord)]
-    for record in (record for part in parts for record in part.report["frames"]):
-        folder.frames[record["id"]] = FrameRecord(**{name: record[name] for name in names if name in record})
+    records = [
+        FrameRecord(**{name: record[name] for name in names if name in record})
+        for part in parts
+        for record in part.report["frames"]
+    ]
+    depth_scale_sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
     joining = tuple(edge for edge in graph.edges if edge.source in parts[1].views and edge.target in parts[0].views)
     best = max((edge.posterior for edge in joining if edge.accepted), key=lambda posterior: posterior.overlap)
     first, root = min(views), {min(views): np.eye(4)}
@@ -185,8 +189,10 @@ def _written(
         edges=joining,
         make_model=lambda: model,
         edges_so_far=graph.edges,
+        frames_so_far=tuple(sorted(records, key=lambda record: record.id)),
         last=True,
     )
+    step = replace(step, verdict=judged(step, depth_scale_sigma=depth_scale_sigma))
     facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
     stream = open_stream(" + ".join(part.name for part in parts), save=folder.path / "recording.rrd", facts=facts)
     try:

@@ -13,8 +13,6 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import (
-    ACCEPTED,
-    AbstractPrior,
     Array,
     Edge,
     Mode,
@@ -25,12 +23,12 @@ from modeler.types import (
     RayImage,
     Solution,
     Step,
-    code,
     explain,
     loop_opening,
     loops_closed,
 )
-from modeler.verdict import FrameRecord, judged
+from modeler.verdict import judged
+from modeler.verdict.evidence import total_depth_scale_sigma
 
 _SCHEMA = 1
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
@@ -56,54 +54,28 @@ class RunMeta:
     """Seed of every random number."""
     prior: str
     """Name of the prior."""
-    known: AbstractPrior | None = field(default=None, repr=False)
-    """The prior itself, which edges are compared with; None: there is none."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Every other option that the results depend on, as JSON values."""
-    closure_expected: bool = False
-    """Whether the object is known to come back to its start, so that a run without closure is not to be trusted."""
-    doubts: Sequence[str] = ()
-    """Further reasons in words not to trust the model."""
     camera: Mapping[str, float | str] | None = None
     """Estimate of the camera, as in report.json: `focal_factor`, `focal_factor_sigma`, `depth_scale`,
     `depth_scale_sigma` and `told_by`; None: the given one is exact."""
-    interrupted: bool = False
-    """Whether the user ended the run before its last frame."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time in s by part of the program."""
     versions: Mapping[str, str] = field(default_factory=_versions)
     """Version by package."""
 
 
-def frame_record(step: Step) -> FrameRecord:
-    """Return the result of the frame of a step."""
-    points = 0 if step.view is None else len(step.view.points_m)
-    reason, mask = step.left_out, step.segmentation.outcome.label
-    outcome, cause = (ACCEPTED, "") if reason is None else (explain(reason), code(reason))
-    return FrameRecord(step.frame.index, float(step.frame.time_s), points, outcome, cause, mask)
-
-
-def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[str, Any]:
+def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
     """Return the report after a step, in values that JSON holds: numbers that are not finite are None.
 
     Args:
         step: the latest.
-        frames: results of all frames so far.
         meta: everything else.
     """
     solution, views, covariances = step.solution, dict(step.views), dict(step.solution.covariances.items())
     if step.view is not None:  # also where the frame was left out
         views[step.frame.index] = step.view
-    camera = _camera(meta.camera, solution, views)
-    verdict = judged(
-        step,
-        frames,
-        doubts=meta.doubts,
-        interrupted=meta.interrupted,
-        closure_expected=meta.closure_expected,
-        prior=meta.known,
-        depth_scale_sigma=0.0 if camera is None else float(camera["depth_scale_sigma"]),
-    )
+    verdict = step.verdict or judged(step)
     support = _support(solution, views)
     report = {
         "schema": _SCHEMA,
@@ -113,25 +85,25 @@ def report_of(step: Step, frames: Sequence[FrameRecord], meta: RunMeta) -> dict[
         "settings": dict(meta.settings),
         "versions": dict(meta.versions),
         "seconds": dict(meta.seconds),
-        "complete": step.last and not meta.interrupted,
+        "complete": step.last and "interrupted" not in verdict.codes,
         "closed": loops_closed(_taking_part(step)) > 0,
         "loop": _loop(step.edges_so_far, solution, views),
-        "camera": camera,
+        "camera": _camera(meta.camera, solution, views),
         "trustworthy": verdict.trustworthy,
-        "reasons": [shortcoming.words for shortcoming in verdict.shortcomings],
-        "reason_codes": [shortcoming.code for shortcoming in verdict.shortcomings],
+        "reasons": verdict.reasons,
+        "reason_codes": verdict.codes,
         "evidence": {
             name: {
-                "value": figure.value,
-                "limit": figure.limit,
-                "at_least": figure.at_least,
-                "holds": figure.holds,
+                "value": check.value,
+                "limit": check.limit,
+                "at_least": check.at_least,
+                "holds": check.holds,
             }
-            for name, figure in verdict.evidence.items()
+            for name, check in verdict.checks.items()
         },
         "up": None if support is None else support.normal,
         "support_offset_m": None if support is None else support.offset_m,
-        "frames": [vars(frame) for frame in frames],
+        "frames": [vars(frame) for frame in step.frames_so_far],
     }
     poses = [
         {"id": frame, "object_from_camera": pose, "covariance": covariances[frame]}
@@ -145,9 +117,6 @@ def _camera(
     given: Mapping[str, float | str] | None, solution: Solution, views: Mapping[int, RayImage]
 ) -> dict[str, Any] | None:
     """Return the estimate of the camera; None if the given one is exact.
-
-    Loops cannot separate focal length and relief of the depth, so that the scale of one of them is as uncertain
-    as they moved the other.
 
     Args:
         given: by the file that the run was made with, as in report.json.
@@ -164,7 +133,7 @@ def _camera(
         "focal_factor": in_run * float(before["focal_factor"]),
         "focal_factor_sigma": focal.sigma,
         "depth_scale": before["depth_scale"],
-        "depth_scale_sigma": math.hypot(float(before["depth_scale_sigma"]), 0.5 * focal.log_factor),
+        "depth_scale_sigma": total_depth_scale_sigma(float(before["depth_scale_sigma"]), focal),
         "told_by": focal.told_by,
         "factor_in_run": in_run,  # beyond the file of a camera
         "fx_px": None if root is None else root.frame.camera.fx,

@@ -13,11 +13,10 @@ from modeler.export.files import PART, settle, settle_soon, write_atomically
 from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
 from modeler.export.pairs import Pairs
 from modeler.export.reading import fault
-from modeler.export.report import RunMeta, frame_record, report_of
+from modeler.export.report import RunMeta, report_of
 from modeler.system.concurrency import Pace
 from modeler.system.regular_files import check_regular, read_json
 from modeler.types import InputError, Step
-from modeler.verdict import FrameRecord
 
 _REPORT = "report.json"
 _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
@@ -41,8 +40,6 @@ class RunFolder:
     """The folder."""
     already: int = 0
     """Number of frames of a resumed run: its files are kept until that is reached again."""
-    frames: dict[int, FrameRecord] = field(default_factory=dict, init=False, repr=False)
-    """Results of the frames so far; a step has only its own."""
     newest: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
     """The report that was written last."""
     pace: Pace = field(default_factory=Pace, init=False, repr=False)
@@ -197,11 +194,10 @@ class RunFolder:
         Raises:
             InputError: if a file cannot be written.
         """
-        self.frames[step.frame.index] = frame_record(step)
-        if not step.last and (len(self.frames) < self.already or self.pace.rests):
+        if not step.last and (len(step.frames_so_far) < self.already or self.pace.rests):
             return self.newest
         began_s = time.monotonic()
-        report = report_of(step, [self.frames[frame] for frame in sorted(self.frames)], meta)
+        report = report_of(step, meta)
         times_s = {frame: view.frame.time_s for frame, view in step.views.items()}
         contents: dict[str, str | bytes] = {
             "trajectory.txt": tum_text(step.solution.trajectory, times_s),

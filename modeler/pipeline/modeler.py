@@ -31,6 +31,7 @@ from modeler.types import (
     Failed,
     FocalLength,
     Frame,
+    FrameRecord,
     Fusing,
     NotJoined,
     Posterior,
@@ -41,6 +42,7 @@ from modeler.types import (
     Solution,
     Step,
 )
+from modeler.verdict import judged
 from modeler.views import Sensor
 
 _FOCAL_ROUNDS = 5  # registrations of the edges at most; eight captures take one to five
@@ -83,28 +85,38 @@ class Modeler:
     cache: AbstractPairCache | None = None
     """Registrations of an interrupted run, if any."""
 
-    def run(self, frames: Iterable[Frame], scene: Scene) -> Iterator[Event]:
-        """Build a model and yield events: for each frame a `Step`, the last of which has the final model.
+    def run(
+        self,
+        frames: Iterable[Frame],
+        scene: Scene,
+        *,
+        closure_expected: bool = False,
+        depth_scale_sigma: float = 0.0,
+    ) -> Iterator[Event]:
+        """Build a model and yield events: for each frame a `Step`, the last of which has the final model and verdict.
 
         To skip or shorten the refinement, iterate over the phases of `start(scene)` instead.
 
         Args:
             frames: in order of time; read one ahead, because the last frame is always compared with the first.
             scene: as the segmenter estimated it from the sequence.
+            closure_expected: whether the object is known to come back to its start.
+            depth_scale_sigma: standard deviation of the depth scale's logarithm; 0 = exact.
 
         Raises:
             InputError: if two frames have the same number.
         """
-        run = self.start(scene)
+        run = self.start(scene, closure_expected=closure_expected, depth_scale_sigma=depth_scale_sigma)
         yield from run.track(frames)
         yield from run.revisit()
         yield from run.rejoin()
         yield from run.refine()
         yield from run.finish()
 
-    def start(self, scene: Scene) -> Run:
-        """Return a run before its first frame."""
-        return Run(replace(self, sensor=self.sensor.measured(scene.range_noise)), scene)
+    def start(self, scene: Scene, *, closure_expected: bool = False, depth_scale_sigma: float = 0.0) -> Run:
+        """Return a run before its first frame; for the arguments see `run`."""
+        measured = replace(self, sensor=self.sensor.measured(scene.range_noise))
+        return Run(measured, scene, closure_expected=closure_expected, depth_scale_sigma=depth_scale_sigma)
 
     def prepare(self, frame: Frame, scene: Scene) -> Prepared:
         """Segment a frame and prepare it for registration."""
@@ -201,6 +213,12 @@ class Run:
     """As the segmenter estimated it from the sequence."""
     state: State = field(default_factory=State)
     """The state so far."""
+    closure_expected: bool = False
+    """Whether the object is known to come back to its start."""
+    depth_scale_sigma: float = 0.0
+    """Standard deviation of the depth scale's logarithm; 0 = exact."""
+    records: dict[int, FrameRecord] = field(default_factory=dict, init=False)
+    """Results of the frames so far."""
 
     def __post_init__(self) -> None:
         """Start with an empty preview."""
@@ -281,8 +299,12 @@ class Run:
             self.state = state
             yield event
 
-    def finish(self) -> Iterator[Step | Fusing]:
-        """Solve the graph with the noise that its edges share, fuse the final model and yield the last step."""
+    def finish(self, *, interrupted: bool = False) -> Iterator[Step | Fusing]:
+        """Solve the graph with the noise that its edges share, fuse and judge the model, and yield the last step.
+
+        Args:
+            interrupted: whether the user ended the run before its last frame.
+        """
         newest, model = self.state.newest, None
         if newest is None:
             return
@@ -294,7 +316,15 @@ class Run:
             model = widened(model, self.state.solution)
         spans = self.state.spans
         last = self._step(newest, [edge.posterior for edge in spans], spans)
-        yield replace(last, last=True, make_model=lambda: model)
+        last = replace(last, last=True, make_model=lambda: model)
+        verdict = judged(
+            last,
+            interrupted=interrupted,
+            closure_expected=self.closure_expected,
+            prior=self.modeler.prior,
+            depth_scale_sigma=self.depth_scale_sigma,
+        )
+        yield replace(last, verdict=verdict)
 
     def _refinement(self, state: State) -> Iterator[tuple[State, Refining]]:
         """Yield a state with the edges of the refinement so far."""
@@ -421,7 +451,7 @@ class Run:
         views, solution, ready = self.state.views, self.state.solution, self.state.ready
         # The views that were registered are passed on, so that they need not be recomputed to draw a pair.
         compared = {posterior.target: ready[posterior.target] for posterior in posteriors if posterior.target in ready}
-        return Step(
+        step = Step(
             frame=prepared.frame,
             segmentation=prepared.segmentation,
             view=prepared.view,
@@ -433,6 +463,8 @@ class Run:
             edges_so_far=self.state.graph.edges,
             views={**views, **compared},
         )
+        self.records[step.frame.index] = step.record
+        return replace(step, frames_so_far=tuple(self.records[frame] for frame in sorted(self.records)))
 
 
 def _with_last(items: Iterable[T]) -> Iterator[tuple[T, bool]]:

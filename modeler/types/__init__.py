@@ -61,6 +61,10 @@ from modeler.types.solution import loop_opening as loop_opening
 from modeler.types.solution import loop_openings as loop_openings
 from modeler.types.solution import loops_closed as loops_closed
 from modeler.types.solution import segments as segments
+from modeler.types.verdict import Check as Check
+from modeler.types.verdict import FrameRecord as FrameRecord
+from modeler.types.verdict import Shortcoming as Shortcoming
+from modeler.types.verdict import Verdict as Verdict
 from modeler.types.views import COLOUR_SHIFT_PX as COLOUR_SHIFT_PX
 from modeler.types.views import NOMINAL_FOCAL as NOMINAL_FOCAL
 from modeler.types.views import Camera as Camera

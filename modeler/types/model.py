@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from modeler.types.base import Array
 from modeler.types.posteriors import Posterior
-from modeler.types.reasons import Reason
+from modeler.types.reasons import ACCEPTED, Reason, code, explain
 from modeler.types.solution import Edge, Solution
+from modeler.types.verdict import FrameRecord, Verdict
 from modeler.types.views import Frame, RayImage, Segmentation
 
 
@@ -74,8 +75,12 @@ class Step:
     views: Mapping[int, RayImage] = field(default_factory=dict)
     """Every accepted view by frame number; those of the posteriors with the images that a likelihood looks up, if these
     are in memory."""
+    frames_so_far: tuple[FrameRecord, ...] = ()
+    """Results of every frame so far, in order of their numbers."""
     last: bool = False
     """True for the final step."""
+    verdict: Verdict | None = None
+    """Whether the model can be trusted; only the final step has one."""
 
     @cached_property
     def model(self) -> ObjectModel | None:
@@ -86,6 +91,14 @@ class Step:
     def accepted(self) -> bool:
         """Whether the frame is part of the model."""
         return self.left_out is None
+
+    @property
+    def record(self) -> FrameRecord:
+        """The result of the frame."""
+        points = 0 if self.view is None else len(self.view.points_m)
+        reason, mask = self.left_out, self.segmentation.outcome.label
+        outcome, cause = (ACCEPTED, "") if reason is None else (explain(reason), code(reason))
+        return FrameRecord(self.frame.index, float(self.frame.time_s), points, outcome, cause, mask)
 
 
 @dataclass(frozen=True)

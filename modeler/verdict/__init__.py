@@ -1,4 +1,3 @@
 """Whether the model of a run can be trusted, and why not."""
 
-from modeler.verdict.judgement import FrameRecord as FrameRecord
 from modeler.verdict.judgement import judged as judged

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -16,7 +17,9 @@ from modeler.types import (
     AbstractPrior,
     Array,
     BoolArray,
+    Check,
     Edge,
+    FocalLength,
     InputError,
     JoinsSegments,
     LoopOpening,
@@ -57,24 +60,7 @@ _MIN_COSINE: Final = 0.5  # beyond 60° range noise grows with slope
 _NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then accurate to 0.1 %
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One value of the evidence."""
-
-    value: float
-    """The measured value."""
-    limit: float
-    """Beyond it, the model is not trusted."""
-    at_least: bool = False
-    """Whether the limit is a lower one."""
-
-    @property
-    def holds(self) -> bool:
-        """Whether the value is within its limit."""
-        return self.value >= self.limit if self.at_least else self.value <= self.limit
-
-
-def displacement(views: Mapping[int, RayImage], solution: Solution) -> Figure | None:
+def displacement(views: Mapping[int, RayImage], solution: Solution) -> Check | None:
     """Return the largest displacement in m of the first view's surface, as root mean square.
 
     None for fewer than two views.
@@ -90,7 +76,7 @@ def displacement(views: Mapping[int, RayImage], solution: Solution) -> Figure | 
         )
         for frame in frames[1:]
     ]
-    return Figure(max(moved_m), MIN_MOTION_SDS * first.sigma_r_m, at_least=True)
+    return Check(max(moved_m), MIN_MOTION_SDS * first.sigma_r_m, at_least=True)
 
 
 @dataclass(frozen=True)
@@ -101,7 +87,7 @@ class Contradiction:
     """Frame number of the source view."""
     target: int
     """Frame number of the target view."""
-    figure: Figure
+    check: Check
     """Standard deviations of a Gaussian prior in six dimensions: √(2 Δ), with Δ in nats from the prior's mode to the
     posterior's mean. Defined alike for other densities."""
 
@@ -161,10 +147,10 @@ def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | No
     if not distances:
         return None
     edge, nats = max(distances, key=lambda found: found[1])
-    return Contradiction(edge.source, edge.target, Figure(float(np.sqrt(2.0 * nats)), float(np.sqrt(chdtri(6, TAIL)))))
+    return Contradiction(edge.source, edge.target, Check(float(np.sqrt(2.0 * nats)), float(np.sqrt(chdtri(6, TAIL)))))
 
 
-def prior_figure(distances: Sequence[tuple[Edge, float]]) -> Figure | None:
+def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
     """Return the mean squared distance of the odometry edges from a Gaussian prior, per degree of freedom.
 
     A wrong step shows a little in every pair. Under a true prior, a posterior's mean is nearer to the mode than the
@@ -177,10 +163,10 @@ def prior_figure(distances: Sequence[tuple[Edge, float]]) -> Figure | None:
     if not squared:
         return None
     freedom = 6 * len(squared)
-    return Figure(sum(squared) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
+    return Check(sum(squared) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
-def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] | None:
+def loop_check(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Check] | None:
     """Return the loop with the largest closure error in standard deviations, with its limit; None without a loop.
 
     The NEES of a closure error follows χ² with six degrees of freedom. For the largest of several loops, the tail
@@ -190,10 +176,10 @@ def loop_figure(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Figure] |
     if not finite:
         return None
     worst = max(finite, key=lambda opening: opening.sigmas)
-    return worst, Figure(worst.sigmas, float(np.sqrt(chdtri(6, LOOP_TAIL / len(finite)) / 6.0)))
+    return worst, Check(worst.sigmas, float(np.sqrt(chdtri(6, LOOP_TAIL / len(finite)) / 6.0)))
 
 
-def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
+def graph_check(edges: Sequence[Edge], solution: Solution) -> Check | None:
     """Return the edges' squared residuals in units of their covariances, per degree of freedom; None for a tree.
 
     Args:
@@ -210,10 +196,10 @@ def graph_figure(edges: Sequence[Edge], solution: Solution) -> Figure | None:
     ]
     xi = se3.log(np.stack(apart))
     whitened = np.linalg.solve(np.stack([pose.covariance for pose in poses]), xi[..., None])[..., 0]
-    return Figure(float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
+    return Check(float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
-def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]) -> Figure:
+def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]) -> Check:
     """Return the probability that some pair is not at its heaviest mode, by the weights after the graph.
 
     Alternative alignments of segments count likewise. Modes that differ by less than the error limits are one.
@@ -239,7 +225,7 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
         settled *= float(np.sum(np.asarray(weights)[alike]) / np.sum(weights))
     for share in {edge.reason.share for edge in edges if isinstance(edge.reason, JoinsSegments)}:
         settled *= share
-    return Figure(1.0 - settled, MAX_OTHER_MODE)
+    return Check(1.0 - settled, MAX_OTHER_MODE)
 
 
 @dataclass(frozen=True)
@@ -248,7 +234,7 @@ class Spread:
 
     frame: int
     """Frame number."""
-    figure: Figure
+    check: Check
     """Standard deviation, see `one_axis_sd`. At the limit, a Gaussian is wrong with probability `WRONG_SHARE`."""
     count: int
     """Number of frames beyond the limit."""
@@ -261,7 +247,7 @@ def misfit(edges: Sequence[Edge], solution: Solution) -> float:
         edges: those that take part.
         solution: the poses.
     """
-    fit = graph_figure(edges, solution)
+    fit = graph_check(edges, solution)
     return 1.0 if fit is None else float(np.sqrt(max(fit.value, 1.0)))
 
 
@@ -349,10 +335,23 @@ def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
     worst = max(sigmas, key=lambda frame: sigmas[frame], default=None)
     if worst is None:
         return None
-    return Spread(worst, Figure(sigmas[worst], limit), sum(sigma > limit for sigma in sigmas.values()))
+    return Spread(worst, Check(sigmas[worst], limit), sum(sigma > limit for sigma in sigmas.values()))
 
 
-def size_figure(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], depth_scale_sigma: float) -> Figure:
+def total_depth_scale_sigma(given: float, focal: FocalLength | None) -> float:
+    """Return the standard deviation of the depth scale's logarithm.
+
+    Loops cannot separate focal length and relief of the depth, so that the scale of one of them is as uncertain as they
+    moved the other.
+
+    Args:
+        given: as the camera was given.
+        focal: estimated from the loops of the run.
+    """
+    return given if focal is None else math.hypot(given, 0.5 * focal.log_factor)
+
+
+def size_check(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], depth_scale_sigma: float) -> Check:
     """Return the uncertainty of the surface in m due to that of the depth scale.
 
     A model is called wrong if less than 90 % of its surface lies within `WRONG_M`: its reach is the distance from its
@@ -370,7 +369,7 @@ def size_figure(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], 
     ]
     surface_m = np.concatenate(surfaces_m) if surfaces_m else np.zeros((1, 3))
     reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_SEEN_THROUGH)
-    return Figure(depth_scale_sigma * float(reach_m), WRONG_M)
+    return Check(depth_scale_sigma * float(reach_m), WRONG_M)
 
 
 @dataclass(frozen=True)
@@ -379,11 +378,11 @@ class FreeSpace:
 
     frame: int
     """Number of the frame with the largest share of free-space violations."""
-    seen_through: Figure
+    seen_through: Check
     """That share of all observations of its surface by others and of theirs by it."""
     contradicted_frame: int
     """Number of the frame with the largest share of contradicted surface."""
-    absent: Figure
+    absent: Check
     """That share: points in the free space of two frames or more, and of most of those that observe them."""
 
 
@@ -423,9 +422,9 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -
     worst, barest = int(np.argmax(shares)), int(np.argmax(bare))
     return FreeSpace(
         frames[worst],
-        Figure(float(shares[worst]), MAX_SEEN_THROUGH),
+        Check(float(shares[worst]), MAX_SEEN_THROUGH),
         frames[barest],
-        Figure(float(bare[barest]), MAX_ABSENT),
+        Check(float(bare[barest]), MAX_ABSENT),
     )
 
 

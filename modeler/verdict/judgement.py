@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -15,14 +15,18 @@ from modeler.types import (
     AWAY_DEG,
     NEAR_DEG,
     AbstractPrior,
+    Check,
     Edge,
     Failed,
     FocalLength,
+    FrameRecord,
     LowOverlap,
     OptimisationOutlier,
     Outcome,
+    Shortcoming,
     Solution,
     Step,
+    Verdict,
     explain,
     joined_without,
     loop_openings,
@@ -32,83 +36,29 @@ from modeler.types import (
 from modeler.verdict.evidence import (
     MAX_UNSURE,
     WRONG_M,
-    Figure,
     contradiction,
     displacement,
     free_space,
-    graph_figure,
-    loop_figure,
+    graph_check,
+    loop_check,
     misfit,
     other_modes,
+    prior_check,
     prior_distances,
-    prior_figure,
-    size_figure,
+    size_check,
     spread_by_focal_length,
     spread_of_positions,
     spread_of_rotations,
+    total_depth_scale_sigma,
 )
 
 _NO_SURFACE: Final = "poses are wrong, masks include more than the object, or it changed its shape"
 _LITTLE_OVERLAP: Final = 0.5  # with less overlap, registrations are sometimes wrong with a small covariance
 
 
-@dataclass(frozen=True)
-class FrameRecord:
-    """The result of one frame."""
-
-    id: int
-    """Frame number."""
-    timestamp: float
-    """Time of capture in s."""
-    points: int
-    """Number of surface points on the object."""
-    outcome: str
-    """`ACCEPTED`, or the reason in words why the frame was left out."""
-    cause: str = ""
-    """The machine-readable reason, from `types.code`; "" for accepted frames."""
-    mask: str = Outcome.CONVERGED.label
-    """Label of the segmentation's outcome."""
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the frame is part of the model."""
-        return self.outcome == ACCEPTED
-
-
-@dataclass(frozen=True)
-class Shortcoming:
-    """A reason not to trust a model."""
-
-    code: str
-    """For programs: `doubt`, `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
-    `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
-    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes`, `unsure_rotation`,
-    `unsure_place`, `unsure_focal` or `unsure_size`."""
-    words: str
-    """For people."""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a model can be trusted."""
-
-    shortcomings: tuple[Shortcoming, ...] = ()
-    """Reasons not to trust it; empty if it can be trusted."""
-    evidence: Mapping[str, Figure] = field(default_factory=dict)
-    """Figures by name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
-    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, as available."""
-
-    @property
-    def trustworthy(self) -> bool:
-        """Whether the model can be trusted."""
-        return not self.shortcomings
-
-
 def judged(
     step: Step,
-    frames: Sequence[FrameRecord],
     *,
-    doubts: Sequence[str] = (),
     interrupted: bool = False,
     closure_expected: bool = False,
     prior: AbstractPrior | None = None,
@@ -118,14 +68,12 @@ def judged(
 
     Args:
         step: the latest.
-        frames: results of all frames so far.
-        doubts: further reasons in words not to trust it.
         interrupted: whether the user ended the run before its last frame.
         closure_expected: whether the object is known to come back to its start.
         prior: of the motions; None: not known here.
-        depth_scale_sigma: standard deviation of the depth scale's logarithm; 0 = exact.
+        depth_scale_sigma: standard deviation of the depth scale's logarithm, as the camera was given; 0 = exact.
     """
-    reasons = [Shortcoming("doubt", words) for words in doubts]
+    reasons, frames = [], step.frames_so_far
     if interrupted:
         reasons.append(Shortcoming("interrupted", f"the run was interrupted after frame {step.frame.index}"))
     elif not step.last:
@@ -142,7 +90,7 @@ def judged(
     reasons += _unconfirmed_join(edges)
     spreads = [*_spreads(step, edges), *_size(step, depth_scale_sigma)] if step.last else []
     reasons += _against(spreads)
-    return Verdict(tuple(reasons), {finding.name: finding.figure for finding in (*found, *spreads)})
+    return Verdict(tuple(reasons), {finding.name: finding.check for finding in (*found, *spreads)})
 
 
 @dataclass(frozen=True)
@@ -150,14 +98,14 @@ class _Finding:
     """A value of the evidence, and the reason given if it exceeds its limit."""
 
     name: str
-    figure: Figure
+    check: Check
     code: str
     words: str
 
 
 def _against(found: Sequence[_Finding]) -> list[Shortcoming]:
     """Return the findings that exceed their limits, the first per code."""
-    against = [finding for finding in found if not finding.figure.holds]
+    against = [finding for finding in found if not finding.check.holds]
     words = {finding.code: finding.words for finding in reversed(against)}
     return [Shortcoming(code, words[code]) for code in dict.fromkeys(finding.code for finding in against)]
 
@@ -178,7 +126,7 @@ def _found(
     if accepted:
         unsure = sum(frame.mask == Outcome.UNSURE_MASK.label for frame in accepted)
         words = f"the masks of {unsure} of {len(accepted)} frames are unsure: another object may have been modelled"
-        found.append(_Finding("unsure_masks", Figure(unsure / len(accepted), MAX_UNSURE), "unsure_masks", words))
+        found.append(_Finding("unsure_masks", Check(unsure / len(accepted), MAX_UNSURE), "unsure_masks", words))
     if (moved_m := displacement(views, solution)) is not None:
         words = (
             f"the object did not move measurably: its surface moved by {1000.0 * moved_m.value:.1f} mm at most, and "
@@ -190,21 +138,21 @@ def _found(
     if (against := contradiction(distances)) is not None:
         words = (
             f"the images contradict the prior: from frame {against.target} to {against.source} the object moved "
-            f"{against.figure.value:.0f} standard deviations from the prior"
+            f"{against.check.value:.0f} standard deviations from the prior"
         )
-        found.append(_Finding("prior_sds", against.figure, "prior_contradicted", words))
-    if (together := prior_figure(distances)) is not None:
+        found.append(_Finding("prior_sds", against.check, "prior_contradicted", words))
+    if (together := prior_check(distances)) is not None:
         words = (
             f"the images contradict the prior in all pairs together: squared distances from it are "
             f"{together.value:.1f} times those of its standard deviations (up to {together.limit:.1f} by chance)"
         )
         found.append(_Finding("prior_chi2", together, "prior_contradicted", words))
     centroids_m = {frame: view.centroid_m for frame, view in views.items()}
-    if (loop := loop_figure(loop_openings(step.edges_so_far, solution, centroids_m))) is not None:
-        opening, figure = loop
+    if (loop := loop_check(loop_openings(step.edges_so_far, solution, centroids_m))) is not None:
+        opening, check = loop
         words = f"{opening.words}: the focal length, the depth scale or an edge is wrong"
-        found.append(_Finding("loop_sigmas", figure, "loop_open", words))
-    if (fit := graph_figure(edges, solution)) is not None:
+        found.append(_Finding("loop_sigmas", check, "loop_open", words))
+    if (fit := graph_check(edges, solution)) is not None:
         words = (
             f"the edges contradict each other: their squared residuals are {fit.value:.1f} times those "
             f"expected from their covariances (up to {fit.limit:.1f} by chance)"
@@ -231,16 +179,16 @@ def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
     """Return the uncertainty of the poses of a whole run."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
     if (turn := spread_of_rotations(step.solution, factor)) is not None:
-        words = f"the rotation of frame {turn.frame} is uncertain by {turn.figure.value:.1f}° (one standard deviation)"
-        words += f", {turn.count - 1} more by over {turn.figure.limit:.1f}°" if turn.count > 1 else ""
+        words = f"the rotation of frame {turn.frame} is uncertain by {turn.check.value:.1f}° (one standard deviation)"
+        words += f", {turn.count - 1} more by over {turn.check.limit:.1f}°" if turn.count > 1 else ""
         by_focal_deg, _ = spread_by_focal_length(step.views, step.solution, turn.frame)
-        found.append(_explained(_Finding("pose_sd_deg", turn.figure, "unsure_rotation", words), by_focal_deg, focal))
+        found.append(_explained(_Finding("pose_sd_deg", turn.check, "unsure_rotation", words), by_focal_deg, focal))
     if (place := spread_of_positions(step.views, step.solution, factor)) is not None:
-        value_mm, limit_mm = 1000.0 * place.figure.value, 1000.0 * place.figure.limit
+        value_mm, limit_mm = 1000.0 * place.check.value, 1000.0 * place.check.limit
         words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
         words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""
         _, by_focal_m = spread_by_focal_length(step.views, step.solution, place.frame)
-        found.append(_explained(_Finding("pose_sd_m", place.figure, "unsure_place", words), by_focal_m, focal))
+        found.append(_explained(_Finding("pose_sd_m", place.check, "unsure_place", words), by_focal_m, focal))
     return found
 
 
@@ -252,7 +200,7 @@ def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> 
         by_focal: standard deviation caused by the focal length alone, in the finding's unit.
         focal: estimate of the focal length.
     """
-    if focal is None or 2.0 * by_focal**2 < spread.figure.value**2:
+    if focal is None or 2.0 * by_focal**2 < spread.check.value**2:
         return spread
     why = f"mostly because the focal length is known only to {100.0 * focal.sigma:.1f} %"
     return replace(spread, code="unsure_focal", words=f"{spread.words}, {why}")
@@ -260,14 +208,15 @@ def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> 
 
 def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:
     """Return the uncertainty of the model's size, if the depth scale is not exact."""
+    depth_scale_sigma = total_depth_scale_sigma(depth_scale_sigma, step.solution.focal)
     if depth_scale_sigma == 0.0:
         return []
-    figure = size_figure(step.views, step.solution.trajectory, depth_scale_sigma)
+    check = size_check(step.views, step.solution.trajectory, depth_scale_sigma)
     words = (
-        f"the model's size is known only to {100.0 * depth_scale_sigma:.0f} %, {1000.0 * figure.value:.0f} mm of its "
+        f"the model's size is known only to {100.0 * depth_scale_sigma:.0f} %, {1000.0 * check.value:.0f} mm of its "
         "surface: loops cannot separate errors of focal length and depth"
     )
-    return [_Finding("size_m", figure, "unsure_size", words)]
+    return [_Finding("size_m", check, "unsure_size", words)]
 
 
 def _left_out(frames: Sequence[FrameRecord], segment_of: Mapping[int, int]) -> list[str]:

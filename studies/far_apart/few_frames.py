@@ -25,7 +25,6 @@ from modeler.cli import compose
 from modeler.cli.advice import comes_back
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, translation_error_m, true_motion
-from modeler.export.report import RunMeta, frame_record, report_of
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Step
 from studies.calibration.specimens import SPECIMENS, Half, load_specimen
@@ -97,23 +96,16 @@ def built(name: str, views: int, prior: str) -> Built:
     options = PriorOptions(prior=prior)  # pyright: ignore[reportArgumentType]
     began = time.process_time()
     modeler = compose.modeler(sequence, options, MethodOptions(seed=0), ObjectOptions())
-    records, centres_m, last = {}, {}, None
-    for event in modeler.run(sequence, compose.scene(modeler, sequence)):
+    centres_m, last = {}, None
+    closes = comes_back(sequence, modeler.prior, modeler.closer.max_angle_deg)
+    for event in modeler.run(sequence, compose.scene(modeler, sequence), closure_expected=closes):
         if isinstance(event, Step):
-            records[event.frame.index] = frame_record(event)
             if event.view is not None:
                 centres_m[event.frame.index] = event.view.centroid_m
             last = event
     seconds = time.process_time() - began
     assert last is not None
-    meta = RunMeta(
-        sequence=name,
-        seed=0,
-        prior=prior,
-        known=modeler.prior,
-        closure_expected=comes_back(sequence, modeler.prior, modeler.closer.max_angle_deg),
-    )
-    report = report_of(last, list(records.values()), meta)
+    assert last.verdict is not None
     trajectory, truth = last.solution.trajectory, sequence.truth()
     errors = [(0.0, 0.0)]
     first = min(trajectory, default=0)
@@ -126,8 +118,8 @@ def built(name: str, views: int, prior: str) -> Built:
         frames=views,
         error_deg=max(error for error, _ in errors),
         error_m=max(error for _, error in errors),
-        status=0 if report["trustworthy"] else 3,
-        reasons=tuple(report["reasons"]),
+        status=0 if last.verdict.trustworthy else 3,
+        reasons=last.verdict.reasons,
         seconds=seconds,
     )
 

@@ -13,7 +13,6 @@ from modeler import se3
 from modeler.cli import compose
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, true_motion
-from modeler.export.report import RunMeta, frame_record, report_of
 from modeler.priors import HeldPrior
 from modeler.sequences import AbstractSequence
 from modeler.sequences.hand_shapes import HandMarkedSequence, HandShape
@@ -157,13 +156,10 @@ def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
             given = HandMarkedSequence(recorded, hand_shape(recorded), poses)
     hidden = _hidden(recorded)
     began = time.perf_counter()
-    last, records = None, {}
-    for event in modeler.run(given, compose.scene(modeler, given)):
-        if isinstance(event, Step):
-            records[event.frame.index], last = frame_record(event), event
-    assert last is not None
+    *_, last = modeler.run(given, compose.scene(modeler, given))
+    assert isinstance(last, Step)
+    assert last.verdict is not None
     seconds = time.perf_counter() - began
-    report = report_of(last, list(records.values()), RunMeta(recorded.name, 0, holder, known=modeler.prior))
     trajectory, truth = last.solution.trajectory, recorded.truth()
     first, *others = sorted(trajectory)
     relative = {frame: se3.inverse(trajectory[first]) @ trajectory[frame] for frame in others}
@@ -183,8 +179,8 @@ def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
         float(np.max(errors_deg, initial=0.0)),
         float(np.mean(normalised)) if normalised else np.nan,
         score or 0.0,
-        0 if report["trustworthy"] else 3,
-        tuple(report["reasons"]),
+        0 if last.verdict.trustworthy else 3,
+        last.verdict.reasons,
         seconds,
         told,
     )

@@ -69,7 +69,7 @@ def followed(shape: str) -> int:
     lags_s, first_model_s, last = [], np.inf, None
     with tempfile.TemporaryDirectory() as place:
         stream = open_stream(shape, save=Path(place) / "recording.rrd")
-        folder, meta = RunFolder.open(Path(place) / "run"), RunMeta(shape, 0, "velocity", known=modeler.prior)
+        folder, meta = RunFolder.open(Path(place) / "run"), RunMeta(shape, 0, "velocity")
         with in_background(stream, lambda step: not step.last, share=DRAWING_SHARE) as draw:
             began_s = time.monotonic()
             for event in run.track(newest, live=True):

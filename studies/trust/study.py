@@ -14,7 +14,7 @@ from modeler.cli import compose
 from modeler.cli.advice import comes_back
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import TrueSurface, align_to_model, rotation_error_deg, surface_errors, true_motion
-from modeler.export.report import RunMeta, frame_record, report_of
+from modeler.export.report import RunMeta, report_of
 from modeler.sequences import AbstractSequence
 from modeler.sequences.rendering.meshes import Mesh
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel, Step
@@ -152,20 +152,10 @@ def built(recorded: AbstractSequence, options: PriorOptions, seed: int) -> tuple
     """
     modeler = compose.modeler(recorded, options, MethodOptions(seed=seed), ObjectOptions())
     scene = compose.scene(modeler, recorded)
-    records, last = {}, None
-    for event in modeler.run(recorded, scene):
-        if isinstance(event, Step):
-            records[event.frame.index] = frame_record(event)
-            last = event
-    assert last is not None
-    meta = RunMeta(
-        sequence=recorded.name,
-        seed=seed,
-        prior=str(options.prior),
-        known=modeler.prior,
-        closure_expected=comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg),
-    )
-    return last, report_of(last, list(records.values()), meta)
+    closes = comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg)
+    *_, last = modeler.run(recorded, scene, closure_expected=closes)
+    assert isinstance(last, Step)
+    return last, report_of(last, RunMeta(recorded.name, seed, str(options.prior)))
 
 
 def pose_errors(recorded: WithTruth, step: Step) -> tuple[float | None, float | None]:

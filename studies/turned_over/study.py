@@ -11,7 +11,6 @@ from typing import Any, final
 from modeler.cli import compose
 from modeler.cli.advice import comes_back
 from modeler.cli.options import MethodOptions, ObjectOptions
-from modeler.export.report import RunMeta, frame_record, report_of
 from modeler.types import Step
 from studies.trust.plan import Half
 from studies.trust.stage import Recorded
@@ -89,21 +88,11 @@ def outcome(plan: Plan, folder: Path) -> Outcome:
     len(recorded.indices)  # rendered before the clock starts
     began = time.perf_counter()
     modeler = compose.modeler(recorded, options, MethodOptions(seed=plan.seed % 1000), ObjectOptions())
-    records, last = {}, None
-    for event in modeler.run(recorded, compose.scene(modeler, recorded)):
-        if isinstance(event, Step):
-            records[event.frame.index] = frame_record(event)
-            last = event
-    assert last is not None
+    closes = comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg)
+    *_, last = modeler.run(recorded, compose.scene(modeler, recorded), closure_expected=closes)
+    assert isinstance(last, Step)
+    assert last.verdict is not None
     seconds = time.perf_counter() - began
-    meta = RunMeta(
-        sequence=recorded.name,
-        seed=0,
-        prior=str(options.prior),
-        known=modeler.prior,
-        closure_expected=comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg),
-    )
-    report = report_of(last, list(records.values()), meta)
     trajectory = last.solution.trajectory
     error_deg, error_m = pose_errors(recorded, last)
     return Outcome(
@@ -117,8 +106,8 @@ def outcome(plan: Plan, folder: Path) -> Outcome:
             sum(frame < FRAMES for frame in trajectory),
             sum(frame > max(plan.gap_frames, default=FRAMES - 1) for frame in trajectory),
         ),
-        status=0 if report["trustworthy"] else 3,
-        reasons=tuple(report["reasons"]),
+        status=0 if last.verdict.trustworthy else 3,
+        reasons=last.verdict.reasons,
         error_deg=error_deg,
         error_m=error_m,
         f_score=None if last.model is None else f_score(recorded, last.model, trajectory),

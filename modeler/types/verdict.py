@@ -1,0 +1,88 @@
+"""Whether a model can be trusted, and the results of frames on which that depends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from modeler.types.base import Outcome
+from modeler.types.reasons import ACCEPTED
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """The result of one frame."""
+
+    id: int
+    """Frame number."""
+    timestamp: float
+    """Time of capture in s."""
+    points: int
+    """Number of surface points on the object."""
+    outcome: str
+    """`ACCEPTED`, or the reason in words why the frame was left out."""
+    cause: str = ""
+    """The machine-readable reason, from `types.code`; "" for accepted frames."""
+    mask: str = Outcome.CONVERGED.label
+    """Label of the segmentation's outcome."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the frame is part of the model."""
+        return self.outcome == ACCEPTED
+
+
+@dataclass(frozen=True)
+class Check:
+    """A measured value, compared with its limit."""
+
+    value: float
+    """The measured value."""
+    limit: float
+    """Beyond it, the model is not trusted."""
+    at_least: bool = False
+    """Whether the limit is a lower one."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value is within its limit."""
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+
+@dataclass(frozen=True)
+class Shortcoming:
+    """A reason not to trust a model."""
+
+    code: str
+    """For programs: `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
+    `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
+    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes`, `unsure_rotation`,
+    `unsure_place`, `unsure_focal` or `unsure_size`."""
+    words: str
+    """For people."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a model can be trusted."""
+
+    shortcomings: tuple[Shortcoming, ...] = ()
+    """Reasons not to trust it; empty if it can be trusted."""
+    checks: Mapping[str, Check] = field(default_factory=dict)
+    """By name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
+    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, as available."""
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the model can be trusted."""
+        return not self.shortcomings
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is not trusted, in words."""
+        return tuple(shortcoming.words for shortcoming in self.shortcomings)
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """The same for programs."""
+        return tuple(shortcoming.code for shortcoming in self.shortcomings)
