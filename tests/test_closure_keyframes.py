@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 
+import gtsam
 import numpy as np
 import pytest
 from closure_runs import Run
 
 from modeler import se3
 from modeler.closure import Closer
-from modeler.graph.covariance import SquareRoot
 from modeler.types import Edge
 
 KEYFRAME_DEG = 25.0
@@ -26,9 +26,13 @@ def turns() -> Run:
 
 def _size(edges: Sequence[Edge]) -> int:
     """Return how many numbers the square root of the information of edges holds."""
-    rows = [{edge.target: -np.eye(6), edge.source: np.eye(6)} for edge in edges]
-    cliques = SquareRoot().plus([{0: np.eye(6)}, *rows]).cliques()
-    return sum(clique.r.size + clique.s.size for clique in cliques)
+    unit = gtsam.noiseModel.Unit.Create(6)
+    linear = gtsam.GaussianFactorGraph()
+    linear.add(gtsam.JacobianFactor(0, np.eye(6), np.zeros(6), unit))
+    for edge in edges:
+        linear.add(gtsam.JacobianFactor(edge.target, -np.eye(6), edge.source, np.eye(6), np.zeros(6), unit))
+    net = linear.eliminateSequential(gtsam.Ordering.OrderingType.METIS)
+    return sum(net.at(k).R().size + net.at(k).S().size for k in range(net.size()))
 
 
 def test_keyframes_are_apart_and_one_is_near_every_view(turns: Run) -> None:

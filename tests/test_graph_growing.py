@@ -12,9 +12,8 @@ import pytest
 from ring_graphs import edge, measured, spin, spun, turntable
 
 from modeler import se3
-from modeler.graph import PoseGraph, Smoother, covariance, optimise, solve
-from modeler.graph.covariance import Rows, SquareRoot
-from modeler.types import Array, Edge, Mode, PoseGaussian, Solution
+from modeler.graph import PoseGraph, Smoother, optimise, solve
+from modeler.types import Edge, Mode, PoseGaussian, Solution
 
 COUNT, PER_TURN = 40, 12
 
@@ -153,30 +152,6 @@ def test_frames_of_one_edge_have_the_covariances_of_the_batch() -> None:
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
 
 
-def test_factors_are_linearised_again_only_around_a_closed_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-
-    def counted(factors: Sequence[object], *args: object) -> object:
-        asked.append(len(factors))
-        return rows(factors, *args)  # pyright: ignore[reportArgumentType]
-
-    growing, rows = Smoother(), covariance._linearise
-    for edges in _arrivals(np.random.default_rng(12)):
-        growing = growing.plus(edges)
-    assert growing.solution.covariances[1].shape == (6, 6)
-    monkeypatch.setattr(covariance, "_linearise", counted)
-    for number, edges in enumerate(_tail(6, np.random.default_rng(13))):
-        growing = growing.plus(edges)
-        assert growing.solution.covariances[COUNT + number].shape == (6, 6)
-        assert growing.solution.relative_covariance(3, COUNT + number).shape == (6, 6)
-    assert asked == [1] * 6
-    closing = _arrivals(np.random.default_rng(14))[-1][1:]
-    growing = growing.plus(closing)
-    assert growing.solution.covariances[1].shape == (6, 6)
-    assert len(asked) == 7
-    assert asked[6] < len(growing.graph.edges) // 2  # those around the loop
-
-
 def test_two_continuations_of_one_solution_are_independent() -> None:
     trunk = Smoother()
     for edges in _arrivals(np.random.default_rng(15)):
@@ -186,27 +161,7 @@ def test_two_continuations_of_one_solution_are_independent() -> None:
     other = [edge(other[0].target, COUNT, vague)]
     here, there = trunk.plus(one).solution, trunk.plus(other).solution
     assert np.trace(there.covariances[COUNT]) > 3.0 * np.trace(here.covariances[COUNT])
-    np.testing.assert_array_equal(here.covariances[COUNT - 1], there.covariances[COUNT - 1])
-
-
-def test_one_covariance_is_computed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    growing = Smoother()
-    for edges in _arrivals(np.random.default_rng(18)):
-        growing = growing.plus(edges)
-    wanted = dict(solve(growing.graph, {}).covariances.items())
-    with monkeypatch.context() as patch:
-        patch.setattr(covariance, "_root_covariance", None)  # without which not all can be worked out
-        covariances = growing.solution.covariances
-        assert COUNT - 1 in covariances
-        assert COUNT not in covariances
-        for _ in range(2):
-            found = covariances[COUNT - 1]
-            np.testing.assert_allclose(found, wanted[COUNT - 1], rtol=1e-4, atol=1e-4 * np.abs(found).max())
-    for frame, found in covariances.items():
-        np.testing.assert_allclose(found, wanted[frame], rtol=1e-4, atol=1e-4 * np.abs(found).max())
-    np.testing.assert_array_equal(covariances[3], dict(covariances.items())[3])
-    with pytest.raises(KeyError):
-        covariances[COUNT]
+    np.testing.assert_allclose(here.covariances[COUNT - 1], there.covariances[COUNT - 1], rtol=1e-9)
 
 
 def test_a_solution_keeps_none_of_those_before_it() -> None:
@@ -218,104 +173,3 @@ def test_a_solution_keeps_none_of_those_before_it() -> None:
     assert kept[-1]() is growing.solution.relative_covariance
     gc.collect()
     assert [covariance() for covariance in kept[:-1]] == [None] * (len(kept) - 1)
-
-
-# Square roots of information: whatever came, went and hung on, the squares are those of the rows that are left.
-
-
-def _row(rng: np.random.Generator, *variables: int) -> Rows:
-    return {variable: rng.normal(size=(6, 6)) for variable in variables}
-
-
-def _information(rows: Sequence[Rows]) -> Array:
-    """All rows, dense, squared."""
-    variables = sorted({variable for some in rows for variable in some})
-    dense = [np.hstack([some.get(variable, np.zeros((6, 6))) for variable in variables]) for some in rows]
-    stacked = np.vstack(dense)
-    return stacked.T @ stacked
-
-
-def _square(root: SquareRoot) -> Array:
-    variables, cliques = sorted(root.clique_of), root.cliques()
-    size = 6 * len(variables)
-    total = np.zeros((size, size))
-    for clique in cliques:
-        columns = np.concatenate([6 * variables.index(v) + np.arange(6) for v in (*clique.frontals, *clique.separator)])
-        block = np.hstack([clique.r, clique.s])
-        total[np.ix_(columns, columns)] += block.T @ block
-    return total
-
-
-def _assert_hangs_together(root: SquareRoot) -> None:
-    """Ways lead from every clique to a root, and parents hold what hangs on them."""
-    for clique in root.cliques():
-        parent = root.parent(clique)
-        if parent is not None:
-            assert set(clique.separator) <= {*parent.frontals, *parent.separator}
-            assert clique in root.children[parent]
-            assert root.rank[clique.frontals[-1]] < root.rank[parent.frontals[-1]]
-    assert sum(len(below) for below in root.children.values()) == sum(
-        bool(clique.separator) for clique in root.cliques()
-    )
-    np.testing.assert_array_equal(sorted(v for c in root.cliques() for v in c.frontals), sorted(root.clique_of))
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_it_is_the_square_root_of_the_rows_that_are_left(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    root, tree, loops = SquareRoot(), [_row(rng, 0)], []
-    root = root.plus(tree)
-    for step in range(1, 30):
-        added = [_row(rng, step, int(rng.integers(max(0, step - 3), step)))]
-        if rng.random() < 0.3:
-            added.append(_row(rng, *rng.choice(step, size=min(step, 2), replace=False).tolist()))
-        gone = [loops.pop(int(rng.integers(len(loops))))] if loops and rng.random() < 0.2 else []
-        before, square = root, _square(root)
-        root = root.plus(added, gone)
-        tree, loops = [*tree, added[0]], [*loops, *added[1:]]
-        np.testing.assert_allclose(_square(root), _information([*tree, *loops]), atol=1e-9)
-        np.testing.assert_array_equal(_square(before), square)  # a value
-        _assert_hangs_together(root)
-    assert len(root.cliques()) > 5
-
-
-def test_cliques_keep_their_numbers_and_nothing_else() -> None:
-    rng = np.random.default_rng(3)
-    pairs = [(k, j) for k in range(60) for j in range(max(0, k - 1), k)] + [(k, k - 12) for k in range(12, 60)]
-    root = SquareRoot().plus([_row(rng, 0), *(_row(rng, *pair) for pair in pairs)])
-    wide = 0
-    for clique in root.cliques():
-        assert all(array.base is None for array in (clique.r, clique.s, *clique.marginal))
-        assert all(block.any(axis=1).all() for block in clique.marginal)  # no zeros below the diagonal
-        heights = {len(rows) for rows in clique.separator_rows.values()} if clique.marginal else {0}
-        assert heights == {max(map(len, clique.marginal), default=0)}
-        wide = max(wide, len(clique.marginal))
-    assert wide > 3
-
-
-def test_what_hangs_on_one_row_leaves_all_else_alone() -> None:
-    rng = np.random.default_rng(0)
-    trunk = SquareRoot().plus([_row(rng, 0), *(_row(rng, k, k + 1) for k in range(20)), _row(rng, 0, 20)])
-    grown = trunk.plus([_row(rng, 21, 20), _row(rng, 31)]).plus([_row(rng, 30, 21)])
-    assert set(trunk.cliques()) < set(grown.cliques())
-    assert len(grown.cliques()) == len(trunk.cliques()) + 3
-    _assert_hangs_together(grown)
-
-
-def test_a_row_concerns_the_cliques_above_its_variables_alone() -> None:
-    rng = np.random.default_rng(1)
-    chain = [_row(rng, 0), *(_row(rng, k, k + 1) for k in range(300))]
-    root = SquareRoot().plus(chain)
-    grown = root.plus([_row(rng, 150, 300)])
-    assert set(root.cliques()) - set(grown.cliques()) == set(root.path_to_roots([150, 300]))
-    assert len(root.path_to_roots([150, 300])) < 30
-
-
-def test_ways_stay_short_however_long_a_chain_grows() -> None:
-    rng = np.random.default_rng(2)
-    root, rows = SquareRoot(), [_row(rng, 0), *(_row(rng, k, k + 1) for k in range(400))]
-    for row in rows:
-        root = root.plus([row])
-        assert len(root.path_to_roots([max(root.clique_of)])) <= 41
-    _assert_hangs_together(root)
-    np.testing.assert_allclose(_square(root), _information(rows), atol=1e-9)

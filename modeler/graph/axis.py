@@ -15,11 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.graph.covariance import Rows, chi_square_quantile
+from modeler.graph.covariance import chi_square_quantile
 from modeler.graph.pose_graph import Factor, inverse_right_jacobian
 from modeler.priors.common_axis import MIN_TURN_RAD
 from modeler.types import Array, segments
 
+Rows = Mapping[int, Array]
+"""By variable, blocks (m, 6) of whitened rows."""
 _SLIP = [0, 1, 3, 4, 5]  # components of ξ other than the rotation about the axis
 _AXIS = gtsam.symbol("a", 0)  # beyond all frame numbers
 # Standard deviations of A about its initial estimate, rad and m. The rotation about the axis is not observable and is
@@ -117,8 +119,8 @@ class AxisSolution:
 
     poses: Mapping[int, Array]
     """object_from_camera (4, 4) by frame number."""
-    rows: Sequence[Rows]
-    """The axis' factors there: whitened rows of errors in object coordinates."""
+    factors: Sequence[gtsam.JacobianFactor]
+    """The axis' factors there, linearised."""
     camera_from_axis: Array
     """(4, 4), the axis the third direction."""
 
@@ -158,12 +160,8 @@ class CommonAxis:
         poses, rows = problem.minimised({**trajectory, _AXIS: start})
         if not self._fits(rows[len(factors) + 1 :], 2.0 * (_half_square(rows) - alone)):
             return None
-        to_object = {key: se3.adjoint(se3.inverse(pose)) for key, pose in poses.items() if key != _AXIS}
-        rows_in_object: list[Rows] = [
-            {key: block @ to_object[key] if key in to_object else block for key, block in blocks.items()}
-            for blocks, _ in rows[len(factors) :]
-        ]
-        return AxisSolution({frame: poses[frame] for frame in trajectory}, rows_in_object, poses[_AXIS])
+        of_axis = [_gaussian_factor(blocks, np.zeros(len(error))) for blocks, error in rows[len(factors) :]]
+        return AxisSolution({frame: poses[frame] for frame in trajectory}, of_axis, poses[_AXIS])
 
     def _fits(self, steps: Sequence[tuple[Rows, Array]], cost: float) -> bool:
         """Return whether steps may share an axis that adds `cost` to the squared Mahalanobis distance (eq. G8).

@@ -86,9 +86,9 @@ def optimise(
     return Optimum(poses_of(found, start, root), taking_part, error)
 
 
-def anchor(root: int) -> gtsam.PriorFactorPose3:
-    """Return the prior that fixes the root's pose at the identity."""
-    return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA))
+def anchor(root: int, sigma: float = _ANCHOR_SIGMA) -> gtsam.PriorFactorPose3:
+    """Return the prior that fixes the root's pose at the identity, with a standard deviation in rad and m."""
+    return gtsam.PriorFactorPose3(root, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, sigma))
 
 
 def values_of(poses: Mapping[int, Array]) -> gtsam.Values:
@@ -119,10 +119,12 @@ def selected(loops: Sequence[Factor], taking_part: Sequence[bool]) -> list[Facto
     return [loop for loop, good in zip(loops, taking_part, strict=True) if good]
 
 
-def gtsam_graph_of(factors: Iterable[Factor], root: int) -> gtsam.NonlinearFactorGraph:
+def gtsam_graph_of(
+    factors: Iterable[Factor], root: int, root_sigma: float = _ANCHOR_SIGMA
+) -> gtsam.NonlinearFactorGraph:
     """Return the GTSAM graph of factors and the prior of the root."""
     gtsam_graph = gtsam.NonlinearFactorGraph()
-    gtsam_graph.add(anchor(root))
+    gtsam_graph.add(anchor(root, root_sigma))
     for factor in factors:
         gtsam_graph.push_back(factor.between)
     return gtsam_graph

@@ -16,7 +16,7 @@ The error of the focal length moves all edges together; each motion's covariance
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -55,15 +55,6 @@ class SharedCovariance:
             KeyError: if a frame was not solved.
         """
         return self._widened(self.independent(target, source), target, source)
-
-    def marginals(self) -> Mapping[int, Array]:
-        """Return covariances (6, 6) of ξ in `object_from_camera @ exp(ξ)` by frame number."""
-        return self._marginals
-
-    @cached_property
-    def _marginals(self) -> dict[int, Array]:
-        root = self.independent.root
-        return {frame: self._widened(single, root, frame) for frame, single in self.independent.marginals().items()}
 
     def _widened(self, independent: Array, target: int, source: int) -> Array:
         if target == source:

@@ -114,7 +114,7 @@ class Smoother:
             again = replace(self, state=_State()).to(graph)
             if len(again.solution.outliers) <= inlier.count(False):
                 return again
-        solution = self._solution(state, (tree, loops), trajectory, grew=grew and graph is not self.graph)
+        solution = self._solution(state, (tree, loops), trajectory)
         return replace(self, graph=graph, solution=replace(solution, odometry=odometry), state=state)
 
     @property
@@ -127,8 +127,6 @@ class Smoother:
         state: _State,
         factors: tuple[Sequence[Factor], Sequence[Factor]],
         trajectory: Mapping[int, Array],
-        *,
-        grew: bool,
     ) -> Solution:
         """Return the solution without its odometry.
 
@@ -136,7 +134,6 @@ class Smoother:
             state: intermediate results.
             factors: tree and loops, with the modes that the loops select.
             trajectory: object_from_camera (4, 4) by frame number, without an axis.
-            grew: whether the graph is an extension of the previous solution's.
         """
         root, (tree, loops), inlier = state.root or 0, factors, state.inlier
         with_axis: AxisSolution | None = None
@@ -144,13 +141,12 @@ class Smoother:
             inlier, with_axis = self._with_axis(self.axis, tree, loops, trajectory, state)
         trajectory = trajectory if with_axis is None else with_axis.poses
         taking_part = [*tree, *selected(loops, inlier)]
-        relative_covariance = self._covariance(taking_part, trajectory, with_axis, root=root, grew=grew)
+        axis_factors = () if with_axis is None else with_axis.factors
+        relative_covariance = self._covariance(RelativeCovariance(trajectory, root, taking_part, axis_factors))
         several = [factor for factor in (*tree, *loops) if factor.modes]
         return Solution(
             trajectory=trajectory,
-            covariances=PoseCovariances(
-                trajectory, functools.partial(relative_covariance, root), relative_covariance.marginals
-            ),
+            covariances=PoseCovariances(trajectory, functools.partial(relative_covariance, root)),
             outliers=tuple(loop.edge for loop, good in zip(loops, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
             edge_poses={(factor.source, factor.target): factor.pose for factor in several},
@@ -178,26 +174,12 @@ class Smoother:
                 return grown, True
         return SpanningTree.of(factors, root), False
 
-    def _covariance(
-        self,
-        factors: Sequence[Factor],
-        trajectory: Mapping[int, Array],
-        with_axis: AxisSolution | None,
-        *,
-        root: int,
-        grew: bool,
-    ) -> RelativeCovariance | SharedCovariance:
-        """Return the covariances of a solution, updated from the previous ones if the graph grew."""
-        before = self.solution.relative_covariance
-        if isinstance(before, SharedCovariance):
-            before = before.independent
-        if with_axis is None and isinstance(before, RelativeCovariance) and grew:
-            found = before.at(trajectory, factors)
-        else:
-            found = RelativeCovariance(trajectory, root, factors, () if with_axis is None else with_axis.rows)
+    def _covariance(self, independent: RelativeCovariance) -> RelativeCovariance | SharedCovariance:
+        """Return covariances with the errors that edges share."""
+        factors = independent.factors
         if not (factors and (self.shared or self.common or self.focal or self.common_shift_m2 is not None)):
-            return found
-        return SharedCovariance(found, factors, self.shared, self.common, self.focal, self.common_shift_m2)
+            return independent
+        return SharedCovariance(independent, factors, self.shared, self.common, self.focal, self.common_shift_m2)
 
     def _with_axis(
         self,

@@ -1,8 +1,8 @@
 """Information of further edges about the poses: covariances of frames of a graph, before and after.
 
-Errors are those of object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k), as in
-`graph.covariance`: an edge with covariance Σ measures δ_source − δ_target with the information
-Ω = Adᵀ Σ⁻¹ Ad, Ad that of source_from_object (docs/method.md, eq. N1).
+Errors are those of object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k): an edge
+with covariance Σ measures δ_source − δ_target with the information Ω = Adᵀ Σ⁻¹ Ad, Ad that of source_from_object
+(docs/method.md, eq. N1).
 """
 
 from __future__ import annotations
