@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import tabletop
 from test_free_space import NOISES, scene
-from test_kernels import far_from_borders, parameters, random_pose, random_projection
+from test_kernels import random_pose
 
-from modeler import se3
-from modeler.kernels import gpu, paper, scores
+from modeler.kernels import gpu, paper
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration import PaperRegistrar
 from modeler.registration.baselines.paper import FreeSpace, NumberedDraws, measured
 from modeler.se3 import rows
 from modeler.sequences import bundled
-from modeler.types import Plane, Posterior
+from modeler.types import Plane
 from modeler.views import Sensor
 
 with_warp = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
@@ -41,65 +40,6 @@ def device(request):
         pytest.skip(fault)
     gpu.warp()
     return request.param
-
-
-def test_visibility_is_that_of_numba_for_poses_of_several_pairs_under_other_focal_lengths(device):
-    from modeler.kernels.gpu import visibility
-
-    rng = np.random.default_rng(0)
-    pairs, poses, pair_of, want = [], [], [], []
-    for number in range(4):
-        projections = random_projection(rng, 40), random_projection(rng, 30)
-        pairs.append((*projections, parameters(support=(0.0, -0.8, -0.6, 0.5, 200.0)), parameters(0.006)))
-        tried = np.stack([random_pose(rng, 0.3) for _ in range(60)])
-        tried = tried[far_from_borders(projections[0], tried) & far_from_borders(projections[1], se3.inverse(tried))]
-        assert len(tried) > 20
-        under = np.column_stack([rows(tried), np.exp(rng.normal(0.0, 0.001, len(tried)))])  # focal lengths
-        poses.append(under)
-        pair_of += [number] * len(tried)
-        want.append(scores.scores(under, *pairs[-1]))
-    mixed = rng.permutation(len(pair_of))
-    got = visibility.log_likelihoods(
-        np.concatenate(poses)[mixed], np.array(pair_of, dtype=np.int32)[mixed], pairs, gpu.chosen(device, 1) or ""
-    )
-    assert np.concatenate(want)[:, scores.EXPLAINED].max() > 0.5  # something matches
-    np.testing.assert_allclose(got, np.concatenate(want)[mixed, :2], rtol=0, atol=1e-4 * 70)
-
-
-def test_on_images_visibility_is_that_of_numba_but_where_a_point_meets_a_pixels_border(device, rng):
-    target, source = standing(0), standing(1)
-    poses = se3.moved(
-        POSES[0] @ se3.inverse(POSES[1]), rng.normal(0, 0.02, (2000, 6)), np.array([0, 0, tabletop.DISTANCE_M])
-    )
-    numba, warp = (
-        VisibilityLikelihood(device=where).between(source, target, np.random.default_rng(0))
-        for where in ("cpu", device)
-    )
-    (want, explained, _), (got, explained_there, _) = (pair.scores(poses, 0.002, stride=1) for pair in (numba, warp))
-    same = np.abs(got - want) < 1e-4 * numba.points
-    assert same.mean() > 0.99
-    assert np.mean(np.abs(explained_there - explained) < 1e-6) > 0.99
-    assert explained.max() > 0.5
-
-
-def test_a_pair_registered_on_a_device_is_that_of_the_cpu_but_for_rounding(device):
-    target, source = standing(0), standing(1)
-    density = TablePrior().between(source, target)
-    cpu, there, again, other = (
-        VisibilityRegistrar(VisibilityLikelihood(device=where)).register(  # pyright: ignore[reportArgumentType]
-            source, target, density, rng=np.random.default_rng(seed)
-        )
-        for where, seed in (("cpu", 1), (device, 1), (device, 1), ("cpu", 2))
-    )
-
-    def apart(posterior: Posterior) -> float:
-        xi = se3.difference(posterior.pose.mean, cpu.pose.mean, source.centroid_m)
-        return float(np.sqrt(xi @ np.linalg.solve(cpu.pose.covariance, xi)))
-
-    assert there.outcome is cpu.outcome
-    # Rounding decides which samples are kept; another seed, which points of the surface are compared.
-    assert apart(there) < 0.5 * apart(other)
-    np.testing.assert_array_equal(again.samples, there.samples)
 
 
 @pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
@@ -182,33 +122,32 @@ def test_a_device_that_is_not_there_is_refused_in_one_line(cli, monkeypatch, abs
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if absent == "warp" else object())
     monkeypatch.setattr(ctypes, "CDLL", no_driver)
     gpu.missing.cache_clear()
-    ended = cli("register", bundled("box"), "1", "0", "--device", "cuda")
+    ended = cli("register", bundled("box"), "1", "0", "--device", "cuda", "--method", "paper")
     gpu.missing.cache_clear()
     assert ended.status == 2
     assert len(ended.err.splitlines()) == 1
     assert f"--device cuda: {line}" in ended.err
 
 
-def test_methods_that_run_on_the_cpu_only_say_so(cli):
-    ended = cli("register", bundled("box"), "1", "0", "--device", "cuda", "--method", "icp")
+@pytest.mark.parametrize("method", ["visibility", "icp"])
+def test_methods_that_run_on_the_cpu_only_say_so(cli, method):
+    ended = cli("register", bundled("box"), "1", "0", "--device", "cuda", "--method", method)
     assert ended.status == 2
-    assert "--method icp runs on the CPU only" in ended.err
+    assert f"--method {method} runs on the CPU only" in ended.err
 
 
 @with_warp
 @pytest.mark.slow
 def test_the_source_compiles_for_a_gpu(tmp_path):
     from modeler.kernels.gpu import paper as on_gpu
-    from modeler.kernels.gpu import visibility
 
-    for module, kernel in ((on_gpu, "weigh"), (visibility, "sum_over_points")):
-        gpu.warp().compile_aot_module(module, arch=90, module_dir=str(tmp_path), use_ptx=True)
-        assert any(kernel in path.read_text() for path in tmp_path.glob(f"*{module.__name__}*.ptx"))
+    gpu.warp().compile_aot_module(on_gpu, arch=90, module_dir=str(tmp_path), use_ptx=True)
+    assert any("weigh" in path.read_text() for path in tmp_path.glob(f"*{on_gpu.__name__}*.ptx"))
 
 
 @with_warp
 def test_the_programme_of_measurements_runs_at_small_sizes(capsys, monkeypatch):
-    arguments = ["bench-gpu", "--device", "warp-cpu", "--samples", "20000", "--pairs", "3", "--runs", "1"]
+    arguments = ["bench-gpu", "--device", "warp-cpu", "--samples", "20000", "--runs", "1"]
     monkeypatch.setattr("sys.argv", arguments)
     with pytest.raises(SystemExit) as ended:
         runpy.run_module("studies.bench.gpu", run_name="__main__")

@@ -119,21 +119,19 @@ def registrar(
     Args:
         method: its name.
         colour: whether it may compare colours.
-        device: where it samples and scores poses; None = chosen for each job.
+        device: where `paper` samples and scores poses; None = chosen for each job.
 
     Raises:
         InputError: if it cannot be there, or is not installed.
     """
     if device == "cuda":
-        if method not in ("visibility", "paper"):
+        if method != "paper":
             raise InputError(f"--device cuda: --method {method} runs on the CPU only; leave --device out")
         if (fault := gpu.missing()) is not None:
             raise InputError(f"--device cuda: {fault}")
     match method:
         case "visibility":
-            return registration.VisibilityRegistrar(
-                registration.VisibilityLikelihood(colour=colour, device=device or "auto")
-            )
+            return registration.VisibilityRegistrar(registration.VisibilityLikelihood(colour=colour))
         case "paper":
             return registration.PaperRegistrar(device=device or "auto")
         case "icp":

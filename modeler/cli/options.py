@@ -226,7 +226,7 @@ class MethodOptions:
     colour: Annotated[bool, default("compare, if frames have colour")] = True
     """Do not compare the colours of matching surface."""
     device: Annotated[Literal["cpu", "cuda"] | None, default("cuda if present and faster, else cpu")] = None
-    """Where poses are sampled and scored: cuda needs an NVIDIA GPU and the extra gpu (visibility, paper)."""
+    """Where poses are sampled and scored: cuda needs an NVIDIA GPU and the extra gpu, and --method paper."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
 

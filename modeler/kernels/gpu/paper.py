@@ -5,6 +5,7 @@ the scheduling of threads.
 """
 # pyright: reportInvalidTypeForm=false
 
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -13,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.kernels import paper as twin
-from modeler.kernels.gpu.memory import sent
 
 if TYPE_CHECKING:
     wp = cast("Any", None)  # type checkers do not understand Warp kernels
@@ -37,6 +37,26 @@ NO_REACH, ROUNDED_DOWN = wp.constant(wp.float64(1e6)), wp.constant(wp.float64(1.
 
 AT_ONCE = 1 << 24
 """Number of draws of one launch, which take 192 MB of device memory."""
+
+_sent: dict[tuple[object, ...], wp.array] = {}
+
+
+def sent(array: np.ndarray, device: str, dtype: Any = None) -> wp.array:
+    """Return the copy of a host array on a device, cached while the host array exists; it must not be modified.
+
+    Args:
+        array: of the host.
+        device: name of the Warp device.
+        dtype: Warp type of an element, such as a vector; None = a number.
+    """
+    owner = array
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
+    key = (array.__array_interface__["data"][0], array.shape, array.strides, array.dtype.str, device, dtype)
+    if key not in _sent:
+        _sent[key] = wp.array(array, dtype=Any if dtype is None else dtype, device=device, copy=True)
+        weakref.finalize(owner, _sent.pop, key, None)
+    return _sent[key]
 
 
 @wp.struct

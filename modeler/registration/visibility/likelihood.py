@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from modeler import se3
-from modeler.kernels import gauss_newton, gpu, point_likelihood, point_to_plane, scores
+from modeler.kernels import gauss_newton, point_likelihood, point_to_plane, scores
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
@@ -85,8 +85,6 @@ class VisibilityLikelihood:
     """Fraction of matching points at which that cost has fallen to 1/e."""
     colour: bool = True
     """Whether the colours of matching surface are compared, if both frames have them."""
-    device: gpu.Device = "auto"
-    """Device for scoring poses; descent and refinement run on the CPU."""
 
     def between(self, source: RayImage, target: RayImage, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of target_from_source, at surface points drawn with `rng`."""
@@ -301,14 +299,7 @@ class PairLikelihood:
             self.forward.parameters(blur_m, typical_misfit),
             self.backward.parameters(blur_m, typical_misfit),
         )
-        lookups = len(poses) * sum(side.points.shape[1] for side in sides[:2])
-        device = gpu.chosen(self.forward.model.device, lookups)
-        if device is None or self.colour is not None:  # colours are looked up on the CPU, in the same projection
-            return scores.scores(poses, *sides, self._colours(band, stride))
-        from modeler.kernels.gpu import visibility
-
-        one = np.zeros(len(poses), dtype=np.int32)
-        return visibility.log_likelihoods(poses, one, [sides], device).astype(float)
+        return scores.scores(poses, *sides, self._colours(band, stride))
 
     def tempered(
         self,
