@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from modeler.api import Result, build, register
     from modeler.pipeline import Modeler
     from modeler.priors import (
-        AxesPrior,
         FeaturesPrior,
         GeneralPrior,
         HeldPrior,
@@ -67,7 +66,6 @@ _MODULES = {
     "modeler.api": ("Result", "build", "register"),
     "modeler.pipeline": ("Modeler",),
     "modeler.priors": (
-        "AxesPrior",
         "FeaturesPrior",
         "GeneralPrior",
         "HeldPrior",
@@ -96,7 +94,6 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
-    "AxesPrior",
     "Camera",
     "FeaturesPrior",
     "Frame",

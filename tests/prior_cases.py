@@ -12,7 +12,6 @@ from modeler.priors import (
     AnyMotion,
     AnyTurn,
     AutoPrior,
-    AxesPrior,
     FeaturesPrior,
     GeneralPrior,
     HeldPrior,
@@ -215,7 +214,6 @@ CASES: dict[str, Case] = {
         lambda camera: VelocityPrior(TablePrior()).learned(solution(camera), ()), proposes=True
     ),
     "foreseen": Case(foreseen, proposes=True, shaken=0.03),
-    "axes": Case(lambda _: AxesPrior(), proposes=True, shaken=0.1),
     "features": Case(lambda _: FeaturesPrior(), proposes=True, shaken=0.3),
     "held and table": Case(lambda camera: ProductPrior(held(camera), TablePrior()), proposes=True, shaken=0.03),
     "velocity and held": Case(lambda camera: ProductPrior(velocity(camera), held(camera)), proposes=True, shaken=0.03),

@@ -151,7 +151,6 @@ def test_evidence_is_all_of_the_density_or_what_is_known_without_the_guess(name:
     "name",
     [
         "velocity",
-        "axes",
         "features",
         "turntable that has learnt",
         "turntable that knows which way round",
@@ -227,7 +226,7 @@ def test_a_gaussian_needs_a_covariance(bad: Array) -> None:
 
 
 MAY_BE_ZERO = {"step_sigma_deg", "axis_sigma_deg", "axis_sigma_m", "wobble_deg", "wobble_m"}  # known for certain
-UNITLESS = {"regrasp_probability", "steps", "kernels", "max_offset", "min_elongation", "friction_sigma"}
+UNITLESS = {"regrasp_probability", "steps", "kernels", "max_offset", "friction_sigma"}
 
 
 def test_names_of_parameters_carry_units() -> None:

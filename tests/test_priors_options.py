@@ -21,7 +21,6 @@ from modeler.priors import (
     AnyMotion,
     AnyTurn,
     AutoPrior,
-    AxesPrior,
     FeaturesPrior,
     GeneralPrior,
     HeldPrior,
@@ -116,9 +115,8 @@ def test_the_sequence_says_what_is_known_unless_it_is_asked_otherwise(
     [
         ("general", GeneralPrior(limits_assumed=True)),
         ("table", TablePrior(limits_assumed=True)),
-        ("axes", AxesPrior(GeneralPrior(limits_assumed=True))),
         ("features+table", FeaturesPrior(TablePrior(limits_assumed=True))),
-        ("table+velocity+axes", AxesPrior(VelocityPrior(TablePrior(limits_assumed=True)))),
+        ("table+velocity+features", FeaturesPrior(VelocityPrior(TablePrior(limits_assumed=True)))),
         ("turntable", TurntablePrior(25.0, 3.0)),
         ("table+turntable", TurntablePrior(25.0, 3.0, needs_table=True)),
         ("table+general", ProductPrior(TablePrior(limits_assumed=True), GeneralPrior(limits_assumed=True))),

@@ -20,7 +20,6 @@ from modeler.kernels import gpu
 from modeler.pipeline import Modeler
 from modeler.priors import (
     AutoPrior,
-    AxesPrior,
     FeaturesPrior,
     GeneralPrior,
     HeldPrior,
@@ -57,10 +56,9 @@ _GIVEN = {
     "held": ("held_sigma_deg", "held_sigma_m", "max_gap_s", "max_offset_m", "regrasp_probability"),
     "poke": ("poke_point_m", "poke_direction", "poke_length_m"),
     "velocity": ("velocity_sigma_deg", "velocity_sigma_m"),
-    "axes": (),
     "features": (),
 }
-_GUESSES = ("velocity", "axes", "features")
+_GUESSES = ("velocity", "features")
 
 
 def modeler(
@@ -299,13 +297,7 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
 
 def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPrior:
     """Return a proposal within a known prior."""
-    match name:
-        case "velocity":
-            return VelocityPrior(known, **given)
-        case "axes":
-            return AxesPrior(known)
-        case _:
-            return FeaturesPrior(known)
+    return VelocityPrior(known, **given) if name == "velocity" else FeaturesPrior(known)
 
 
 def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> TurntablePrior:

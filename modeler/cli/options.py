@@ -128,7 +128,7 @@ class PriorOptions:
     turntable: it turns by a commanded step about one axis.
     held: a robot's hand carries it (robot.txt).
     poke: a finger pushes it along the table.
-    Proposals only: velocity (constant velocity), axes (aligned principal axes), features (matching features).
+    Proposals only: velocity (constant velocity), features (matching features).
     module:Class: your own, an AbstractPrior that is a frozen dataclass, imported from the current folder or PYTHONPATH.
     + combines priors: held+table, features+table."""
     prior_args: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE..."), default("the class's own")] = ()

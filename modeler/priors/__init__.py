@@ -7,7 +7,6 @@ from modeler.priors.held import HeldPrior as HeldPrior
 from modeler.priors.poke import Poke as Poke
 from modeler.priors.poke import PokePrior as PokePrior
 from modeler.priors.product import ProductPrior as ProductPrior
-from modeler.priors.proposals import AxesPrior as AxesPrior
 from modeler.priors.proposals import FeaturesPrior as FeaturesPrior
 from modeler.priors.proposals import PredictedProposal as PredictedProposal
 from modeler.priors.proposals import VelocityPrior as VelocityPrior

@@ -11,8 +11,8 @@ import numpy as np
 from modeler import se3
 from modeler.features import FeatureMatcher
 from modeler.priors.checks import check_parameters
-from modeler.priors.general import GeneralPrior, centroid_offset
-from modeler.priors.mixtures import KernelMixture, across_axis, defensive_mixture, directions_about
+from modeler.priors.general import GeneralPrior
+from modeler.priors.mixtures import KernelMixture, defensive_mixture
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, PoseGaussian, RayImage, SharedAxis, Solution
 
 _MIN_SIGMA_RAD, _MIN_SIGMA_M = np.radians(2.0), 0.004  # the search does not need more precision
@@ -142,98 +142,6 @@ class VelocityPrior(AbstractProposal):
         """Return the prior with the poses so far."""
         trajectory = tuple(sorted(solution.trajectory.items(), key=lambda item: item[0]))
         return replace(self, known=self.known.learned(solution, edges), trajectory=trajectory)
-
-
-@dataclass(frozen=True)
-class AxesPrior(AbstractProposal):
-    """The first principal axes of the two surfaces coincide, in either direction; the turn about them is free.
-
-    Surfaces that are not elongated yield no proposal.
-    """
-
-    axes_sigma_deg: float = 6.0
-    """Standard deviation of the angle between the axes, about each axis orthogonal to them."""
-    axes_sigma_m: float = 0.015
-    """Standard deviation of the distance between the centroids, along each axis."""
-    min_elongation: float = 1.6
-    """Least ratio of the standard deviations along the first principal axis and the second."""
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        check_parameters(self)
-
-    def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> AlignedAxes | None:
-        """Return the density of aligned axes; None unless both surfaces are elongated."""
-        first, second = (long_axis(view.points_m, self.min_elongation) for view in (source, target))
-        if first is None or second is None:
-            return None
-        return AlignedAxes(
-            first,
-            second,
-            source_centroid_m=source.centroid_m,
-            target_centroid_m=target.centroid_m,
-            sigma_rad=float(np.radians(self.axes_sigma_deg)),
-            sigma_m=self.axes_sigma_m,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class AlignedAxes(AbstractPoseDensity):
-    """One axis von Mises-Fisher distributed about another, up to sign; uniform turn about it; Gaussian centroid."""
-
-    source_axis: Array
-    """(3,) unit."""
-    target_axis: Array
-    """(3,) unit."""
-    source_centroid_m: Array
-    """(3,)."""
-    target_centroid_m: Array
-    """(3,)."""
-    sigma_rad: float
-    """Standard deviation of the angle between the axes, about each axis orthogonal to them."""
-    sigma_m: float
-    """Standard deviation of the distance between the centroids, along each axis."""
-    evidence: bool = False
-
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
-        axes = directions_about(self.target_axis, self.sigma_rad**-2.0, count, rng)
-        turn = rng.uniform(0.0, 2.0 * np.pi, count)
-        axes *= rng.choice([-1.0, 1.0], (count, 1))
-        spun = se3.exp(np.concatenate([turn[:, None] * self.source_axis, np.zeros((count, 3))], axis=1))
-        poses = _onto(self.source_axis, axes) @ spun
-        place_m = self.target_centroid_m + rng.normal(0.0, self.sigma_m, (count, 3))
-        poses[:, :3, 3] = place_m - poses[:, :3, :3] @ self.source_centroid_m
-        return poses
-
-    def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4)."""
-        concentration = self.sigma_rad**-2.0
-        cosine = np.abs(target_from_source[:, :3, :3] @ self.source_axis @ self.target_axis)
-        # The measure of rotations factors into that of one axis' image and that of the turn about it.
-        sphere = np.log(concentration / (-2.0 * np.pi * np.expm1(-2.0 * concentration)))
-        either = np.logaddexp(concentration * (cosine - 1.0), -concentration * (cosine + 1.0)) - np.log(2.0)
-        offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
-        gaussian = -0.5 * np.sum(offset_m**2, axis=1) / self.sigma_m**2 - 1.5 * np.log(2.0 * np.pi * self.sigma_m**2)
-        return sphere + either - np.log(2.0 * np.pi) + gaussian
-
-
-def long_axis(points_m: Array, min_elongation: float) -> Array | None:
-    """Return the first principal axis (3,) of points (n, 3); None if they are less elongated than required."""
-    if len(points_m) < 3:
-        return None
-    variances, axes = np.linalg.eigh(np.cov(points_m.T))
-    long = np.sqrt(variances[2]) >= min_elongation * np.sqrt(max(variances[1], 0.0))
-    return np.asarray(axes[:, 2], dtype=np.float64) if long else None
-
-
-def _onto(axis: Array, directions: Array) -> Array:
-    """Return the smallest rotations (n, 4, 4) that map a unit vector (3,) to unit vectors (n, 3)."""
-    crossed = np.cross(axis, directions)
-    sine = np.linalg.norm(crossed, axis=1, keepdims=True)
-    perpendicular = np.where(sine > 1e-12, crossed / np.maximum(sine, 1e-300), across_axis(axis)[0])
-    angle_rad = np.arctan2(sine, (directions @ axis)[:, None])
-    return se3.exp(np.concatenate([angle_rad * perpendicular, np.zeros_like(perpendicular)], axis=1))
 
 
 @dataclass(frozen=True)
