@@ -31,8 +31,8 @@ from modeler.viz import entities, reader
 from modeler.viz.report import run_data, write_page
 from modeler.viz.report.evidence import CHECKS
 from modeler.viz.report.mesh import read_mesh, scene
+from modeler.viz.report.page import rotation_words
 from modeler.viz.report.run_data import Result, recorded, surfaces
-from modeler.viz.report.symmetries import rotation_words
 from modeler.viz.stream import open_stream
 
 TRUTH = {k: se3.inverse(object_from_camera(k)) for k in range(COUNT)}

@@ -24,8 +24,7 @@ from modeler import se3
 from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Failed, Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
 from modeler.viz import blueprint, entities, graph_view, images, model_view, pair_view
-from modeler.viz.pose_table import pose_table
-from modeler.viz.readings import sd_of
+from modeler.viz.readings import pose_table, sd_of
 from modeler.viz.stream import graph_due, open_stream
 
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)

@@ -17,7 +17,7 @@ from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Array, Camera, Edge, PoseGaussian, Step
 from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, Drawing, caption, ellipsoids, rounded_down, scale_words
-from modeler.viz.pose_table import pose_table
+from modeler.viz.readings import pose_table
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 """From the object towards the eye that looks at the whole graph."""

@@ -41,7 +41,7 @@ class Gallery:
         from modeler.export.models_table import blank, write_table
         from modeler.system.regular_files import read_regular
         from modeler.types import InputError
-        from modeler.viz.gallery import write_gallery
+        from modeler.viz.report.gallery import write_gallery
 
         out = self.folder / "gallery.html" if self.out is None else self.out
         check_files([out], [], overwrite=self.overwrite)

@@ -63,7 +63,7 @@ def write_gallery(
     ]
     coded = [base64.b64encode(pictures.get(row["name"], b"")).decode() for row in rows]
     columns = [{"words": words, "unit": unit} for words, _, unit in _SHOWN.values()]
-    page = Template((resources.files("modeler.viz.gallery") / "gallery.html").read_text(encoding="utf-8")).substitute(
+    page = Template((resources.files("modeler.viz.report") / "gallery.html").read_text(encoding="utf-8")).substitute(
         title=escape(title), columns=_script(columns), models=_script(models), pictures=_script(coded)
     )
     write_atomically(out, page)
