@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shutil
+import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +22,7 @@ from modeler.sequences.ros import messages
 from modeler.sequences.ros.bag import zstd
 from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
-from studies.formats.image_folders import small_frames
+from studies.formats.image_folders import small_frames, unchecked
 from studies.formats.recorded import foxglove, scene, unpacked
 from studies.formats.ros_bags import COLOUR_FROM_DEPTH, START_NS, Recorder, Rig
 
@@ -241,6 +243,59 @@ def test_a_bag_of_ros_2_that_lacks_its_data_is_one_line(
     assert "missing" in fails(path, capsys)
 
 
+_HOSTILE = {
+    "endless view": "DROP TABLE schema; CREATE VIEW schema AS WITH RECURSIVE r(schema_version) AS "
+    "(SELECT 4 UNION ALL SELECT schema_version FROM r) SELECT max(schema_version) AS schema_version FROM r",
+    "view of topics": "ALTER TABLE topics RENAME TO t; CREATE VIEW topics AS SELECT * FROM t",
+    "generated": "CREATE TABLE m(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+    "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); INSERT INTO m SELECT id, topic_id, timestamp "
+    "FROM messages; DROP TABLE messages; ALTER TABLE m RENAME TO messages",
+}
+
+
+@pytest.mark.parametrize("folder", [False, True])
+@pytest.mark.parametrize("change", _HOSTILE)
+def test_a_database_computes_nothing(
+    tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str], change: str, folder: bool
+) -> None:
+    path = Recorder().write(tmp_path / "s.db3", frames[:2])
+    if folder:
+        (tmp_path / "s" / path.name).write_bytes(path.read_bytes())
+        path = tmp_path / "s"
+    file = next(path.glob("*.db3")) if folder else path
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        database.executescript(_HOSTILE[change])
+    assert str(path) in fails(path, capsys)
+
+
+def test_a_database_that_takes_too_long_is_one_line(
+    tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("modeler.sequences.ros.database._STEP", 10)
+    monkeypatch.setattr("modeler.sequences.ros.database._STEPS", 1)
+    monkeypatch.setattr("modeler.sequences.ros.database._STEPS_PER_BYTE", 0.0)
+    assert "interrupted" in fails(Recorder().write(tmp_path / "s.db3", frames), capsys).lower()
+
+
+def test_messages_that_a_crashed_recorder_left_beside_the_bag_are_not_passed_over(
+    tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = Recorder().write(tmp_path / "s.db3", frames)
+    with contextlib.closing(sqlite3.connect(whole)) as database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("UPDATE messages SET timestamp = timestamp + 1")
+        database.commit()
+        (tmp_path / "crashed").mkdir()
+        for file in tmp_path.glob("s.db3*"):
+            shutil.copy(file, tmp_path / "crashed")
+    path = tmp_path / "crashed" / "s.db3"
+    assert "s.db3-wal: the recorder ended before" in fails(path, capsys)
+    with contextlib.closing(sqlite3.connect(path)) as database:  # as the message says
+        database.execute("PRAGMA wal_checkpoint")
+        database.execute("SELECT count(*) FROM messages")
+    assert len(open_sequence(path)) == len(frames)
+
+
 def test_recordings_without_what_is_needed_are_one_line(
     tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -251,9 +306,9 @@ def test_recordings_without_what_is_needed_are_one_line(
     assert "all is 0 or NaN" in fails(Recorder("32FC1").write(tmp_path / "nan.bag", flat), capsys)
     large = [dataclasses.replace(f, depth_m=f.depth_m * 1000.0) for f in frames]
     assert "looks like millimetres" in fails(Recorder("32FC1").write(tmp_path / "mm.bag", large), capsys)
-    small = [dataclasses.replace(f, depth_m=f.depth_m[:50]) for f in frames]
+    small = [unchecked(f, depth_m=f.depth_m[:50]) for f in frames]
     assert "160 x 50 pixels" in fails(Recorder().write(tmp_path / "size.bag", small), capsys)
-    bent = [dataclasses.replace(f, camera=dataclasses.replace(f.camera, fx=0.0)) for f in frames]
+    bent = [unchecked(f, camera=unchecked(f.camera, fx=0.0)) for f in frames]
     assert "no usable K" in fails(Recorder().write(tmp_path / "k.bag", bent), capsys)
     assert "no depth images" in fails(Recorder("8UC1", None).write(tmp_path / "grey.bag", frames), capsys)
     cut = Cut().write(tmp_path / "cut.bag", frames)

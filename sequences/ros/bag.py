@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast, final
-from urllib.parse import quote
 
 import lz4.frame
 from rosbags import rosbag1, rosbag2
@@ -25,6 +24,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from modeler.sequences.input_files import check_link, entries, input_errors, read_text
+from modeler.sequences.ros.database import database
 from modeler.system.regular_files import open_regular
 from modeler.types import InputError
 
@@ -297,9 +297,9 @@ def _ros2(path: Path) -> rosbag2.Reader:
     if isinstance(reader.storage, DirectoryReader):
         read_text(path / "metadata.yaml")
         storage: Any = reader.storage
-        storage.STORAGE_PLUGINS = {**storage.STORAGE_PLUGINS, "sqlite3": lambda file: Sqlite3Reader(_in_address(file))}
+        storage.STORAGE_PLUGINS = {**storage.STORAGE_PLUGINS, "sqlite3": database}
     elif isinstance(reader.storage, Sqlite3Reader):
-        reader.storage.path = _in_address(path)
+        reader.storage = database(path)
     else:
         _check_profile(path)
         if _profile(path) == "ros1" and isinstance(reader.storage, storage_mcap.McapReader):
@@ -350,8 +350,3 @@ def _check_profile(path: Path) -> None:
         raise InputError(
             f"{path}: holds messages of profile {profile!r} where those of ROS are read from MCAP; record it with ROS."
         )
-
-
-def _in_address(path: Path) -> Path:
-    """Return a path quoted for an address, as the library expects it."""
-    return Path(quote(str(path)))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from PIL import Image
@@ -16,7 +18,16 @@ from modeler import se3
 from modeler.sequences import bundled, open_sequence
 from modeler.types import Camera, Frame
 
+_Value = TypeVar("_Value", Camera, Frame)
 STEP = 4  # every fourth pixel of the bundled images
+
+
+def unchecked(value: _Value, **changes: object) -> _Value:
+    """Return a frame or a camera that none can be made with, as a file may hold it."""
+    changed = copy.copy(value)
+    for name, wrong in changes.items():
+        object.__setattr__(changed, name, wrong)
+    return changed
 
 
 def small_frames(count: int = 4) -> list[Frame]:
