@@ -3,7 +3,7 @@
 A fixed depth camera watches a rigid object that is turned or moved. Pairs of depth images are registered by a
 probabilistic method, whose posteriors become the factors of a pose graph; its optimised poses fuse the images into a
 mesh. The method is that of M. Wüthrich et al., "Probabilistic Depth Image Registration incorporating Nonvisual
-Information", ICRA 2012, and its extensions; see `docs/method.md`.
+Information", ICRA 2012, and its extensions; see `docs/method`.
 
 Two depth images to a relative pose and its covariance:
 

@@ -62,7 +62,7 @@ def kabsch(source_m: Array, target_m: Array) -> Array:
 @final
 @dataclass(frozen=True)
 class FeatureMatcher:
-    """Finds the motions between two views on which matches of their features agree (method.md, "Matching features").
+    """Finds the motions between two views on which matches of their features agree (docs/method/search.md).
 
     Fast Point Feature Histograms of thinned surfaces are matched, and the matches pruned by how well they fit each
     other: in pairs, and in the company of the others (second-order compatibility: Chen, Sun, Yang and Tao, CVPR 2022).

@@ -224,7 +224,7 @@ def test_an_open_chain_tells_nothing_and_is_as_uncertain_as_the_focal_length(rng
 
 
 def test_covariances_are_those_of_a_graph_with_the_focal_length_as_a_variable(rng: np.random.Generator) -> None:
-    """All errors and the logarithm in one dense system of equations (method.md, eq. G12 to G14)."""
+    """All errors and the logarithm in one dense system of equations (method, eq. 10.3 to 10.6)."""
     graph, _ = ring(0.0, rng, luck=1e-3)
     solution, prior_sigma = solve(graph, {}), 0.02
     found = MovingGraph.of(graph, solution).estimate(prior_sigma)

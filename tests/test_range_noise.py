@@ -116,7 +116,7 @@ def test_balls_are_smaller_where_planes_show_less_noise_than_stated() -> None:
         return sensor.ray_image(frame).error_area_px - sensor.noise_area_px
 
     quarter, more = (replace(stated, pixel_sigma_inverse_per_m=share * 0.004 / 0.7**2) for share in (0.25, 2.0))
-    assert ball_px(quarter) == pytest.approx(0.25 * ball_px(stated))  # ρ² is proportional to the noise: eq. 1
+    assert ball_px(quarter) == pytest.approx(0.25 * ball_px(stated))  # ρ² is proportional to the noise: eq. 1.1
     assert ball_px(more) == ball_px(stated)  # the planes may be uneven
 
 
@@ -125,7 +125,7 @@ def test_the_more_pixels_err_alike_the_fewer_patches_a_view_has() -> None:
     views = [Sensor(0.001, 0.0007, noise_area_px=area_px).ray_image(frame) for area_px in (1.0, 10.0, 100.0)]
     counts = [view.patches for view in views]
     assert counts[0] > counts[1] > counts[2]
-    # Two correlated areas each beside the ball: method.md, eq. 23.
+    # Two correlated areas each beside the ball: method, eq. 1.4.
     sharing = [view.sharing for view in views]
     assert (sharing[2] - sharing[1]) / (sharing[1] - sharing[0]) == pytest.approx(10.0, rel=1e-6)
 

@@ -35,7 +35,7 @@ class Closer:
 
     Every view is registered against the previous one. Further pairs are registered if their edge is expected to be
     informative: if the object returns after turning away, or if one edge spans many small steps. A result is accepted
-    if it is consistent with the other edges (method.md, "Closure gate").
+    if it is consistent with the other edges (docs/method/closure.md).
     """
 
     max_angle_deg: float = NEAR_DEG
@@ -49,7 +49,7 @@ class Closer:
     keyframe_deg: float = 10.0
     """Least rotation in degrees between keyframes. Closures only lead to keyframes, so that the graph of many turns is
     one map with chains along it, and each further turn costs the same. The edge to the nearest keyframe has at least
-    97 % of the information of one over no rotation (method.md, eq. C1)."""
+    97 % of the information of one over no rotation (method, eq. 9.1)."""
     max_closures: int = 2
     """Largest number of views, besides the previous one, to register a frame against; 0 = none."""
     min_gain_nats: float = 4.16

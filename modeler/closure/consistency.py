@@ -29,7 +29,7 @@ from modeler.types import (
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Requirements on edges other than that to the previous view; method.md has their origins."""
+    """Requirements on edges other than that to the previous view; docs/method/closure.md has their origins."""
 
     min_overlap: float = 0.4
     """Least overlap (0..1), predicted and measured."""
@@ -64,7 +64,7 @@ class Thresholds:
             return EvidenceBound()
         median = float(np.median(nats))
         scatter = 1.4826 * float(np.median(np.abs(nats - median)))
-        drop_nats = max(self.max_evidence_drop_nats, self.max_evidence_drop_sigmas * scatter)  # method.md, eq. C5
+        drop_nats = max(self.max_evidence_drop_nats, self.max_evidence_drop_sigmas * scatter)  # method, eq. 9.5
         return EvidenceBound(median, median - drop_nats)
 
     def defect(self, posterior: Posterior, evidence: EvidenceBound) -> Reason | None:
@@ -82,7 +82,7 @@ class Thresholds:
         sigma_rad, axis = widest_rotation(posterior)
         known_rad = float(np.sqrt(axis @ predicted.covariance[:3, :3] @ axis))
         known = known_rad <= self.known_share * sigma_rad and np.degrees(sigma_rad) <= self.max_gaussian_deg
-        if np.degrees(sigma_rad) <= self.max_open_deg or known:  # eq. C6
+        if np.degrees(sigma_rad) <= self.max_open_deg or known:  # eq. 9.6
             return None
         return OpenRotation(float(np.degrees(sigma_rad)))
 
@@ -155,7 +155,7 @@ class ConsistencyModel:
             length: number of edges.
             centroid_m: (3,) of the object in that camera.
         """
-        sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)  # method.md, eq. C3
+        sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)  # method, eq. 9.3
         return se3.covariance_about(np.diag(sigmas**2), -centroid_m)
 
     def consistency(
@@ -180,7 +180,7 @@ class ConsistencyModel:
             apart = se3.inverse(predicted.mean) @ own.mean
             xi = se3.log(apart)
             spread = self.sigma_scale**2 * (predicted.covariance + own.covariance) + systematic
-            distance = float(np.sqrt(xi @ np.linalg.solve(spread, xi)))  # method.md, eq. C4
+            distance = float(np.sqrt(xi @ np.linalg.solve(spread, xi)))  # method, eq. 9.4
             agreeing += weight * own_weight if distance <= self.max_distance else 0.0
             if distance < nearest:
                 nearest, difference = distance, apart

@@ -1,4 +1,4 @@
-"""Expected information gain of registering a view against earlier ones (method.md, eq. C1 and C2)."""
+"""Expected information gain of registering a view against earlier ones (method, eq. 9.1 and 9.2)."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class InformationGain:
         if one_edge is None:
             return []
         within_rad = np.radians(np.minimum(angle_deg, self.max_angle_deg))
-        found = np.cos(0.5 * within_rad) ** 2 * self.probability_within(frames, angle_deg)  # method.md, eq. C2
+        found = np.cos(0.5 * within_rad) ** 2 * self.probability_within(frames, angle_deg)  # method, eq. 9.2
         relative_information = np.cos(within_rad) ** self.power
         path_rad2, length = self.paths.to(frames)
         known_rad2 = np.where(found > 0.0, path_rad2 + length * _rotation_variance(self.systematic), 0.0)
@@ -101,7 +101,7 @@ class InformationGain:
             covariance = self.map_view.solution.relative_covariance(frames[k], self.previous)
             covariance = covariance + float(self.has_own_edge) * one_edge + float(length[k]) * self.systematic
             ratios = overlap * relative_information[k] * np.linalg.solve(scale[k] * one_edge, covariance)
-            gain_nats = 0.5 * float(found[k] * np.linalg.slogdet(np.eye(6) + ratios)[1])  # method.md, eq. C1
+            gain_nats = 0.5 * float(found[k] * np.linalg.slogdet(np.eye(6) + ratios)[1])  # method, eq. 9.1
             if gain_nats >= min_gain_nats:
                 candidates.append(Candidate(frames[k], float(angle_deg[k]), overlap, gain_nats))
         return sorted(candidates, key=lambda candidate: -candidate.gain_nats)

@@ -14,7 +14,7 @@ _MIN_COSINE = 0.3  # between normal and the ray to a camera: more grazing surfac
 
 
 def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
-    """Return a model whose vertex uncertainty includes that of the focal length (method.md, eq. F12).
+    """Return a model whose vertex uncertainty includes that of the focal length (method, eq. 12.9).
 
     Args:
         model: fused under the solution's poses.

@@ -115,7 +115,7 @@ def crop(view: RayImage, where: tuple[slice, slice], cropping: Cropping) -> Crop
     away_px = np.asarray(distance_transform_edt(np.pad(within, 1)))[1:-1, 1:-1]
     clearance = np.minimum((away_px + 0.5) / BLEEDING_PX, 1.0)
     cosine = -np.sum(points_m * normals, axis=1) / np.linalg.norm(points_m, axis=1)
-    weights = cosine * np.where(edges[tuple(pixels.T)], cropping.edge_weight, 1.0)  # (F1)
+    weights = cosine * np.where(edges[tuple(pixels.T)], cropping.edge_weight, 1.0)  # eq. 12.1
     kept = cosine >= cropping.min_cosine
     pixels = pixels[kept]
     index = np.full(depth_m.shape, -1, dtype=np.int32)
@@ -156,7 +156,7 @@ def pose_variances(part: Crop, covariance: Array | None, sigma_r_m: float) -> Ar
     """
     if covariance is None:
         return np.zeros(len(part.points_m))
-    # A perturbation ξ = (ω, v) moves a point p along its normal n by ω · (p × n) + v · n (F2).
+    # A perturbation ξ = (ω, v) moves a point p along its normal n by ω · (p × n) + v · n (eq. 12.2).
     rows = np.concatenate([np.cross(part.points_m, part.normals), part.normals], axis=1)
     return np.einsum("ni,ij,nj->n", rows, covariance, rows) / (SMOOTHED * sigma_r_m) ** 2
 
@@ -186,9 +186,9 @@ class DepthViews:
     normals: Array
     """(n, 3) unit normals."""
     weights: Array
-    """(n,) 1 = seen head-on from the median distance, away from edges (docs/method.md, F1 to F3)."""
+    """(n,) 1 = seen head-on from the median distance, away from edges (method, eq. 12.1 to 12.3)."""
     colour_weights: Array
-    """(n,) the same for their colours, which are uncertain farther from edges (docs/method.md, F9)."""
+    """(n,) the same for their colours, which are uncertain farther from edges (method, eq. 12.10)."""
     views: npt.NDArray[np.int64]
     """(n,) the view of each point."""
 
@@ -291,8 +291,8 @@ def depth_views(
     points_m, normals, depth_m, weights, clearance, pose_noise = (
         np.concatenate(some) for some in zip(*surfaces, strict=True)
     )
-    weights = weights * (np.median(depth_m) / depth_m) ** 4  # (F1): the sd of a triangulating camera grows with z²
-    trust = 1.0 / (1.0 + weights * pose_noise)  # (F3)
+    weights = weights * (np.median(depth_m) / depth_m) ** 4  # eq. 12.1: the sd of a triangulating camera grows with z²
+    trust = 1.0 / (1.0 + weights * pose_noise)  # eq. 12.3
     weights *= trust / np.median(trust)
     return DepthViews(
         index=index,
@@ -403,7 +403,7 @@ def _plane(view: RayImage, object_from_camera: Array) -> Array:
 
 
 def disagreement(views: ViewBlocks, limit_m: float) -> tuple[float, float] | None:
-    """Return robust standard deviations of the distance between the surfaces of different views, in m (F4).
+    """Return robust standard deviations of the distance between the surfaces of different views, in m (eq. 12.4).
 
     They contain the noise of both views and the error of their poses. None if no two views see the same surface.
 
@@ -416,7 +416,7 @@ def disagreement(views: ViewBlocks, limit_m: float) -> tuple[float, float] | Non
     """
     samples = min(SAMPLES // len(views.blocks), -(-LOOKUPS // views.count))
     off_m, share_m = (np.concatenate(some) for some in zip(*_distances(views, samples, limit_m), strict=True))
-    # (F4)
+    # eq. 12.4
     return (1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(share_m))) if len(off_m) else None
 
 

@@ -73,7 +73,7 @@ class DistanceField:
 
 
 def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: float) -> DistanceField:
-    """Return the signed distance measured by the views, within ±`tau_m` of the surface (docs/method.md, F5).
+    """Return the signed distance measured by the views, within ±`tau_m` of the surface (method, eq. 12.5).
 
     The distances that several blocks of views measure are averaged by their weights.
     """

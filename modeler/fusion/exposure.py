@@ -16,7 +16,7 @@ DARK, BRIGHT = 12.0, 243.0  # levels (of 255) beyond which a pixel may be clippe
 LOOKUPS = 100_000  # points times views at which colours are compared, which bounds time
 ROUNDS = 8  # of iteratively reweighted least squares
 GAIN_SIGMA = 0.05  # prior sd of log gains; chosen by hand
-LEAST = 1e-3  # weight of the shading itself relative to that of the residuals; see method.md, λ of (F10)
+LEAST = 1e-3  # weight of the shading itself relative to that of the residuals; λ of eq. 12.11
 COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights; chosen by hand
 LARGEST_GAIN = 2.5  # largest factor between exposures; chosen by hand
 
@@ -45,7 +45,7 @@ def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
 
     Each point has one colour, each view a gain, and all views the same lamps, which brighten the surface that faces
     them; the three are fitted to the logarithms of the observed colours of common points
-    (docs/method.md, F10). Sharper views have more weight.
+    (method, eq. 12.11). Sharper views have more weight.
 
     Args:
         views: the views, by block.
@@ -102,7 +102,7 @@ def _fitted(logs: Array, observed: Array, basis: Array) -> tuple[Array, Array]:
     for _ in range(ROUNDS):
         shares = weights / np.maximum(weights.sum(axis=0), 1e-12)
         off, relief = _centred(logs, shares), _centred(basis, shares)
-        # Normal equations of (F10), the points' colours already eliminated, then the gains.
+        # Normal equations of eq. 12.11, the points' colours already eliminated, then the gains.
         weighted = weights[..., None] * relief
         across, inner = weighted.sum(axis=1), np.tensordot(weighted, relief, ((0, 1), (0, 1)))
         totals = weights.sum(axis=1)

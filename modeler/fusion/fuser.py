@@ -42,8 +42,7 @@ class Fuser:
     """Fuse views into a cloud and a mesh.
 
     The mesh is the zero level set of a truncated signed distance function (TSDF; Curless and Levoy 1996, "A volumetric
-    method for building complex models from range images") on voxels near the surface. docs/method.md, section Fusion,
-    has the equations.
+    method for building complex models from range images") on voxels near the surface (docs/method/fusion.md).
     """
 
     voxel_m: float | None = None
@@ -116,7 +115,7 @@ class Fuser:
         seen = view_blocks(pairs, grid.corners_m, cropping, covariances)
         limit_m = 0.05 * float(np.linalg.norm(grid.shape)) * grid.voxel_m
         spread_m, sigma_m = disagreement(seen, limit_m) or (noise_m, SMOOTHED * noise_m)
-        tau_m = 3.0 * grid.voxel_m + 2.0 * spread_m  # (F4)
+        tau_m = 3.0 * grid.voxel_m + 2.0 * spread_m  # eq. 12.4
         return FusionVolume(self, seen.carving(tau_m), grid, tau_m, grid.voxel_m + 2.0 * spread_m, sigma_m)
 
     def voxel_side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
@@ -258,7 +257,7 @@ class FusionVolume:
         found = self._support(vertices, normals, Exposure.blind(self.views.count))
         # Closing gaps in the support must not add what several views see empty.
         empty = found.empty_views * self.fuser.empty_weight > found.weight + self.fuser.empty_weight
-        seen = (found.weight > self.fuser.min_support) & self._supported(found)  # (F7)
+        seen = (found.weight > self.fuser.min_support) & self._supported(found)  # eq. 12.7
         marked = meshing.gaps_closed(seen, triangles, self.fuser.closing) & ~empty
         # At silhouettes the zero level set folds over: views extrapolate the object one band behind its surface.
         loose = meshing.folded(vertices, normals, seen, marked & ~seen)

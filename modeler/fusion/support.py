@@ -45,7 +45,7 @@ def view_support(
     exposure: Exposure,
     focus: float,
 ) -> ViewSupport:
-    """Return what the views observe at oriented points (docs/method.md, F7 to F9).
+    """Return what the views observe at oriented points (method, eq. 12.7, 12.8 and 12.10).
 
     Args:
         views: the views, by block.
@@ -73,13 +73,13 @@ def view_support(
     found = count > 0.0
     safe = np.where(found, weight, 1.0)
     misfit = np.maximum(second - first**2 / safe, 0.0) / sigma_m**2  # χ² of the views about their mean
-    scale = (PRIOR_VIEWS + misfit) / (PRIOR_VIEWS + np.maximum(count - 1.0, 0.0))  # (F8)
+    scale = (PRIOR_VIEWS + misfit) / (PRIOR_VIEWS + np.maximum(count - 1.0, 0.0))  # eq. 12.8
     coloured = colours[:, 3] > 0.0
     return ViewSupport(
         weight=weight,
         empty_views=empty_views,
         views=count.astype(np.int64),
-        sigmas_m=np.where(found, sigma_m * np.sqrt(scale / safe), np.inf),  # (F8)
+        sigmas_m=np.where(found, sigma_m * np.sqrt(scale / safe), np.inf),  # eq. 12.8
         colours=np.rint(np.where(coloured[:, None], colours[:, :3], GREY)).astype(np.uint8),
         coloured=coloured,
     )

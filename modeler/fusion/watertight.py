@@ -42,7 +42,7 @@ def closed_field(field: DistanceField, seen: ViewBlocks, tau_m: float) -> Distan
     """Return the field with all unknown voxels classified as outside or inside.
 
     What views see empty or below the support plane is outside, unless nearly all other views see surface in front of
-    it. The remaining space is divided by the surface of least area that continues what was seen (docs/method.md, F11).
+    it. The remaining space is divided by the surface of least area that continues what was seen (method, eq. 12.12).
     The object ends at its support plane.
     """
     grid = field.grid

@@ -1,7 +1,7 @@
 """A turntable in the graph: the object turns about an unknown axis that is common to all steps.
 
 Between consecutive frames target_from_source = A Rz(θ) exp(slip) A⁻¹, with A = camera_from_axis, whose third direction
-is the axis (method.md, eq. G7). A is one variable shared by all steps, so that each pair informs it once.
+is the axis (method, eq. 8.7). A is one variable shared by all steps, so that each pair informs it once.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def estimated_axis(
 def slip(
     object_from_target: Array, object_from_source: Array, camera_from_axis: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the slip of steps (n, 5), and its derivatives (n, 5, 6) by ξ of the three poses (method.md, eq. G7).
+    """Return the slip of steps (n, 5), and its derivatives (n, 5, 6) by ξ of the three poses (method, eq. 8.7).
 
     Tilt about the first two directions in rad, then shift along all three in m.
 
@@ -104,7 +104,7 @@ def slip(
     back = np.zeros((len(step), 6))
     back[:, 2] = -angle
     rest = se3.exp(back) @ step
-    xi = se3.log(rest)  # method.md, eq. G7
+    xi = se3.log(rest)  # method, eq. 8.7
     across = np.eye(6) - se3.adjoint(se3.inverse(rest))[:, :, 2, None] * slope[:, None]
     derivative = (inverse_right_jacobian(xi) @ across)[:, _SLIP]
     of_source = derivative @ se3.adjoint(se3.inverse(camera_from_axis))
@@ -164,7 +164,7 @@ class CommonAxis:
         return AxisSolution({frame: poses[frame] for frame in trajectory}, of_axis, poses[_AXIS])
 
     def _fits(self, steps: Sequence[tuple[Rows, Array]], cost: float) -> bool:
-        """Return whether steps may share an axis that adds `cost` to the squared Mahalanobis distance (eq. G8).
+        """Return whether steps may share an axis that adds `cost` to the squared Mahalanobis distance (eq. 8.8).
 
         It follows χ²; its degrees of freedom are the steps' conditions minus the axis' parameters, two of its direction
         and two of its position.

@@ -1,4 +1,4 @@
-"""Covariances of solved frames and of the motion between any two, by back substitution (method.md, eq. G5 and G6).
+"""Covariances of solved frames and of the motion between any two, by back substitution (method, eq. 8.5 and 8.6).
 
 Errors are ξ_k with true object_from_camera(k) = object_from_camera(k) exp(ξ_k). GTSAM linearises and eliminates all
 factors. Covariances are sums of squares of what back substitution gives, never differences or inverses, so that an
@@ -51,7 +51,7 @@ class RelativeCovariance:
             return covariance
         order, conditionals = self._net
         right = {source: np.eye(6), target: -se3.adjoint(source_from_target).T}  # columns still to be solved for
-        while right:  # method.md, eq. G6
+        while right:  # method, eq. 8.6
             variable = min(right, key=order.__getitem__)
             conditional = conditionals.at(order[variable])
             solved = _trsm(1.0, conditional.R(), right.pop(variable), trans_a=1)

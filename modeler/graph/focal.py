@@ -1,6 +1,6 @@
-"""The focal length as a variable shared by all edges, estimated from loops (method.md, eq. G12 and G13).
+"""The focal length as a variable shared by all edges, estimated from loops (method, eq. 10.3 and 10.4).
 
-Edges are registered under a focal length that is not known exactly; each has the derivative of its mean by it (eq. 25).
+Edges are registered under a focal length that is not known exactly; each has its mean's derivative (eq. 10.2).
 Loops close under one focal length only; without loops, its prior remains.
 """
 
@@ -19,15 +19,15 @@ from modeler.graph.smoother import Smoother
 from modeler.types import Array, FocalLength, Solution
 
 RELIEF_ERROR = 0.008
-"""Relative error of the depth's relief, which loops cannot distinguish from a focal length: measured, see method.md."""
+"""Relative error of the depth's relief, which loops cannot distinguish from a focal length: measured (eq. 10.4)."""
 
 _STEP = 0.005  # of finite differences, at most a quarter of the prior's standard deviation: a few posterior ones
 _ROUNDS = 8  # of Newton's method at most; near the optimum two or three are enough
 _MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
 _GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
-_CONVERGED = 0.25  # standard deviations that the last registration of the edges moves the estimate: see method.md
-_MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.56 to 1, see method.md
-_DERIVATIVE_ERROR = 0.3  # relative, of an estimate: 0.26 in the median of ten first steps, see method.md
+_CONVERGED = 0.25  # standard deviations that the last registration of the edges moves the estimate
+_MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.56 to 1
+_DERIVATIVE_ERROR = 0.3  # relative, of an estimate: 0.26 in the median of ten first steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class MovingGraph:
         return cls(factors, graph.root or 0, solution.trajectory)
 
     def estimate(self, prior_sigma: float, prior_mean: float = 0.0) -> FocalLength:
-        """Return the logarithm of least error, prior included, by Newton's method (method.md, eq. G12 and G13).
+        """Return the logarithm of least error, prior included, by Newton's method (method, eq. 10.3 and 10.4).
 
         Args:
             prior_sigma: prior standard deviation of the logarithm.
@@ -130,7 +130,7 @@ class MovingGraph:
 def estimate_focal_length(
     estimate_at: Callable[[float], FocalLength], *, rounds: int, reach: float, tolerance: float = _CONVERGED
 ) -> FocalLength:
-    """Return the focal length, estimated iteratively from edges registered under each estimate (method.md, eq. S2).
+    """Return the focal length, estimated iteratively from edges registered under each estimate (method, eq. 10.5).
 
     The derivatives hold near the focal length of the edges only, so that first steps may be too short. The secant
     through the last two steps shows by how much.

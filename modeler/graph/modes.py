@@ -1,8 +1,8 @@
 """Selection among the modes of multimodal edges by loops and the other edges.
 
 A hypothesis selects one mode of every such edge on a loop. Hypotheses are first scored loop by loop, along the tree,
-thousands at once; the best few are then optimised and compared by Laplace's approximation of the evidence (method.md,
-eq. G3). Weights of modes are sums over all near the best: if a shape looks the same from behind, thousands are equal.
+thousands at once; the best few are then optimised and compared by Laplace's approximation of the evidence (method,
+eq. 8.3). Weights of modes are sums over all near the best: if a shape looks the same from behind, thousands are equal.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ class _Search:
         hypothesis: Mapping[Edge, np.int64],
         settled: Mapping[Edge, Array],
     ) -> float:
-        """Return the Laplace approximation of a hypothesis' log evidence (eq. G3), up to a common constant."""
+        """Return the Laplace approximation of a hypothesis' log evidence (eq. 8.3), up to a common constant."""
         of = {edge: int(mode) for edge, mode in hypothesis.items()}
         of |= {edge: int(np.argmax(weights)) for edge, weights in settled.items()}
         tree, loops = ([_chosen(factor, of) for factor in some] for some in (tree, loops))

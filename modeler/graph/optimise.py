@@ -40,7 +40,7 @@ class Optimum:
     inlier: tuple[bool, ...]
     """Whether each loop takes part."""
     error: float
-    """Half the squared Mahalanobis distance of all factors; outliers count as the threshold (eq. G2)."""
+    """Half the squared Mahalanobis distance of all factors; outliers count as the threshold (eq. 8.2)."""
 
 
 def optimise(
@@ -52,7 +52,7 @@ def optimise(
     threshold: float,
     inlier: Sequence[bool] = (),
 ) -> Optimum:
-    """Return the optimum of method.md, eq. G1, and which loops are inliers: those whose error is below the threshold.
+    """Return the optimum of method, eq. 8.1, and which loops are inliers: those whose error is below the threshold.
 
     The given inliers are kept if they are consistent with their optimum: all inliers are below the threshold, all
     others above. Otherwise graduated non-convexity with a truncated least-squares loss selects them.

@@ -72,7 +72,7 @@ class Factor:
         return self.edge.posterior.modes if are_separate(self.edge.posterior.modes) else ()
 
     def under(self, log_factor: float) -> Factor:
-        """Return the factor under a longer focal length (method.md, eq. G12).
+        """Return the factor under a longer focal length (method, eq. 10.3).
 
         Args:
             log_factor: logarithm of the focal length over that of the views.
@@ -217,7 +217,7 @@ def inverse_right_jacobian(xi: Array) -> Array:
 
 
 def collapse_modes(posterior: Posterior, weights: Array | None = None) -> PoseGaussian:
-    """Return a posterior as one Gaussian; separate modes are pooled at the heaviest (eq. G4).
+    """Return a posterior as one Gaussian; separate modes are pooled at the heaviest (eq. 8.4).
 
     Args:
         posterior: with its modes.

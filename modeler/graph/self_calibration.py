@@ -3,7 +3,7 @@
 A surface at angle θ to the image plane, seen with a focal length too short by a factor c, appears at atan(c tan θ), so
 that estimated rotations are too small or too large, and those of a closed loop do not sum up to 360°. A run estimates
 its focal length from the derivatives of its edges, which hold near the given one. Here every edge is registered again
-under each estimate, until convergence (method.md, eq. S2).
+under each estimate, until convergence (method, eq. 10.5).
 """
 
 from __future__ import annotations

@@ -3,15 +3,15 @@
 A fraction ρ of an edge's covariance Σ is due to its two images: pixel noise moves an image as a whole, alike in all its
 edges. Frame k then appears not at T_k but at T_k exp(η_k), with one η_k ~ N(0, Q_k) for all its edges, and edges are
 independent measurements of covariance (1 − ρ) Σ between these apparent poses. The optimum is the same, as one factor on
-all covariances moves nothing; relative covariances are those of method.md, eq. G9: a single edge keeps its covariance,
+all covariances moves nothing; relative covariances are those of method, eq. 8.9: a single edge keeps its covariance,
 several edges of a frame make it no smaller than the images allow, and along a chain the images' noise cancels.
 
 All views may also have a common error: one camera sees one object from one height, and its distance may be biased.
-Every frame then appears at T_k exp(β), with one β ~ N(0, B) in camera coordinates (eq. G10). All loops still close, and
-β is not observable; it cancels between frames that see the same side of the object. It includes a shift of all measured
-surface, as by a biased distance.
+Every frame then appears at T_k exp(β), with one β ~ N(0, B) in camera coordinates (eq. 8.10). All loops still close,
+and β is not observable; it cancels between frames that see the same side of the object. It includes a shift of all
+measured surface, as by a biased distance.
 
-The error of the focal length moves all edges together; each motion's covariance grows by its derivative (eq. G14).
+The error of the focal length moves all edges together; each motion's covariance grows by its derivative (eq. 10.6).
 """
 
 from __future__ import annotations
@@ -61,15 +61,15 @@ class SharedCovariance:
             return independent
         source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
         of_target = se3.inverse_covariance(source_from_target, self._noise.get(target, np.zeros((6, 6))))
-        covariance = (1.0 - self.share) * independent + self._noise.get(source, np.zeros((6, 6))) + of_target  # eq. G9
+        covariance = (1.0 - self.share) * independent + self._noise.get(source, np.zeros((6, 6))) + of_target  # eq. 8.9
         if self.focal is not None:
             zero = np.zeros(6)  # of frames added since
             apart = self.focal.by_focal.get(source, zero) - self.focal.by_focal.get(target, zero)
             moved = self.focal.sigma * se3.adjoint(se3.inverse(self.independent.trajectory[source])) @ apart
-            covariance = covariance + np.outer(moved, moved)  # eq. G14
+            covariance = covariance + np.outer(moved, moved)  # eq. 10.6
         if self.common or self.common_shift_m2 is not None:
             left = np.eye(6) - se3.adjoint(source_from_target)
-            covariance = covariance + left @ self._common_covariance @ left.T  # eq. G10
+            covariance = covariance + left @ self._common_covariance @ left.T  # eq. 8.10
         return 0.5 * (covariance + covariance.T)
 
     @cached_property
@@ -99,7 +99,7 @@ class SharedCovariance:
 
 
 def shared_noise(graph: PoseGraph, solution: Solution) -> float:
-    """Estimate the fraction ρ of edges' covariances that is noise of their images from the loops' errors (eq. G11).
+    """Estimate the fraction ρ of edges' covariances that is noise of their images from the loops' errors (eq. 8.11).
 
     The images' noise cancels around a loop, so that the squared distance over the 6 l conditions of l loops is (1 − ρ)
     of that of independent edges. The estimate is one standard error towards independence, and 0 without loops or if

@@ -1,4 +1,4 @@
-"""Band-pass filters of an image that surface covers in part, sampled at surface points (method.md, eq. 17)."""
+"""Band-pass filters of an image that surface covers in part, sampled at surface points (method, eq. 7.1)."""
 
 import math
 

@@ -30,7 +30,7 @@ _ROWS = 9  # of a match's equation: six derivatives, residual, weight, and a buf
 
 
 class Regulariser(NamedTuple):
-    """Gaussian prior and damping of a descent (method.md, eq. 10)."""
+    """Gaussian prior and damping of a descent (method, eq. 5.2)."""
 
     mean: npt.NDArray[np.float64]
     """(12,) rows of the prior's mean."""
@@ -53,7 +53,7 @@ def normal_equations(poses, surfaces, colours, weight, centre, surface_m):
             those of points as they are, which differ from those under the true focal length by its relative error.
         surfaces: the `Projection` of the source's points in the target, and that of the target's in the source.
         colours: their `Colours`, or `photometric.NO_COLOURS`.
-        weight: inverse variance of the difference of features (method.md, eq. 20).
+        weight: inverse variance of the difference of features (method, eq. 7.4).
         centre: (3,) point of the source in m.
         surface_m: noise of the surfaces in m beyond that of points and planes.
     """
@@ -94,7 +94,7 @@ def new_workspace(surfaces):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gradient, matrix):
-    """Write the normal equations of matches, for ξ of a pose about the centre (method.md, eq. 10 and 20).
+    """Write the normal equations of matches, for ξ of a pose about the centre (method, eq. 5.2 and 7.4).
 
     For small motions ζ = (ω, v) of transformed points about a point c, x → c + exp(ω)(x - c) + v, the gradient is
     -Σ w a r and the matrix Σ w a aᵀ with a = ((x - c) × n, n), n the surface's normal or a feature's gradient. In the
@@ -174,7 +174,7 @@ def accumulate(rows, count, gradient, matrix):
 
 @njit(cache=True, error_model="numpy")
 def add_pattern_gradient(surface, transformed, about, rows, gradient):
-    """Add the fixed pattern's part to the gradient (6,) by ζ about a point (3,) (method.md, eq. 27).
+    """Add the fixed pattern's part to the gradient (6,) by ζ about a point (3,) (method, eq. 4.9).
 
     Args:
         surface: the `Projection` of the points.

@@ -53,7 +53,7 @@ def _observation_counts(layers, origin, cell_m, shape, margin_m, free_m, poses, 
 
 
 def minimal_surface(start, fixed, rounds):
-    """Return the field (x, y, z) of least total variation with the given fixed values (F11).
+    """Return the field (x, y, z) of least total variation with the given fixed values (eq. 12.12).
 
     Its zero level set has the least area: the total variation of a field that jumps between -1 and 1 is twice the area
     of the jump. Solved by the primal-dual algorithm of Chambolle and Pock 2011 ("A first-order primal-dual algorithm

@@ -111,7 +111,7 @@ def compare_in_place(features, others, numbers, offsets):
 
 @njit(cache=True, error_model="numpy")
 def remove_static(features, others, numbers, offsets, share, points_m, focal, values, cells):
-    """Write features regressed on those of another view at the same places, and their cells (method.md, eq. 18).
+    """Write features regressed on those of another view at the same places, and their cells (method, eq. 7.2).
 
     The result has unit variance. A feature is constant along a pixel's ray, so that its gradient in space vanishes
     along it.

@@ -15,7 +15,7 @@ VARIANCE = 4  # of that distance at the pixel, m²
 KIND = 5  # one of the four below
 DEPTH = 6  # measured z, m
 SILHOUETTE = 7  # distance of a pixel outside the object from its silhouette, px
-RIM = 7  # of a pixel of the object, in the same place: weight of errors near its silhouette (method.md, eq. 31)
+RIM = 7  # of a pixel of the object, in the same place: weight of errors near its silhouette (method, eq. 4.8)
 CELL_SIZE = 8
 
 _OUTLIER = 3.0  # standard deviations of a pixel's noise, by convention
@@ -266,7 +266,7 @@ def _local_planes(
 
 @njit(cache=True)
 def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse_per_m):
-    """Write the plane fitted to a pixel's neighbours into its cell (8,), if they determine one (method.md, eq. 1).
+    """Write the plane fitted to a pixel's neighbours into its cell (8,), if they determine one (method, eq. 1.1).
 
     Args:
         cell: with the depth of the pixel.
@@ -290,7 +290,7 @@ def fit_plane(cell, sums, w, h, fx, fy, sigma_inverse_per_m):
     plane_x, plane_y = slope_x * fx, slope_y * fy
     plane_z = along - plane_x * w - plane_y * h
     norm = math.sqrt(plane_x * plane_x + plane_y * plane_y + plane_z * plane_z)
-    # method.md, eq. 2
+    # method, eq. 1.2
     residual = sbb - offset * sb - slope_x * sxb - slope_y * syb
     spread = max(residual / max(n - 3.0, 1.0), sigma_inverse_per_m * sigma_inverse_per_m)
     cell[NORMAL_X], cell[NORMAL_Y], cell[NORMAL_Z] = -plane_x / norm, -plane_y / norm, -plane_z / norm

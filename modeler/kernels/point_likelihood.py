@@ -69,11 +69,11 @@ class Projection(NamedTuple):
     camera: FloatArray
     """(6,) fx, fy, cx, cy, width and height in px of the other view."""
     cosines: FloatArray
-    """(4,) cosines between which f rises from 0 to 1, and g (method.md, eq. 4)."""
+    """(4,) cosines between which f rises from 0 to 1, and g (method, eq. 4.2)."""
     pattern: FloatArray
-    """(2,) fraction χ of the variance common to both views at the same pixel, and 1/R² in 1/px² (eq. 27)."""
+    """(2,) fraction χ of the variance common to both views at the same pixel, and 1/R² in 1/px² (eq. 4.9)."""
     rim_m2: np.float32
-    """Variance in m² of errors near silhouettes (eq. 31); that of the points is part of their variances."""
+    """Variance in m² of errors near silhouettes (eq. 4.8); that of the points is part of their variances."""
 
 
 @njit(cache=True, forceinline=True)
@@ -93,7 +93,7 @@ def write_transform(pose, backward, transform):
     Args:
         pose: (12,) target_from_source; with a 13th number, the factor F of the true focal length over that of both
             views, whose coordinates x and y are to be divided by it. The transform is then S⁻¹ T S, S = diag(1/F, 1/F,
-            1), from points as they are to points as they are (method.md, eq. 29).
+            1), from points as they are to points as they are (method, eq. 10.1).
         backward: whether the points are the target's.
         transform: out.
     """
@@ -111,13 +111,13 @@ def write_transform(pose, backward, transform):
 
 @njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def transform_points(pose, projection, transformed, pixels):
-    """Transform points into the other camera (method.md, eq. 4): branch-free code, which compilers vectorise.
+    """Transform points into the other camera (method, eq. 4.2): branch-free code, which compilers vectorise.
 
     Args:
         pose: (12,) rows of the 3×4 matrix.
         projection: the points and the other camera.
         transformed: (9, n) out: position, normal, visibility f (0..1), expected coverage g (0..1), and the fraction c
-            of a match's variance that is common to both views (eq. 27).
+            of a match's variance that is common to both views (eq. 4.9).
         pixels: (n,) out: index of the pixel on which it falls, row by row; -1 outside the image or behind the camera.
     """
     p0, p1, p2, p3 = np.float32(pose[0]), np.float32(pose[1]), np.float32(pose[2]), np.float32(pose[3])
@@ -190,7 +190,7 @@ def buffers(count):
 
 
 class LikelihoodParameters(NamedTuple):
-    """Parameters of one direction (method.md, eq. 4 to 6 and 21); all float32."""
+    """Parameters of one direction (method, eq. 4.2 to 4.5); all float32."""
 
     blur_m: np.float32
     """Noise b of the surfaces."""
@@ -214,7 +214,7 @@ class LikelihoodParameters(NamedTuple):
 
 @njit(cache=True)
 def match_table(hidden):
-    """Return log((1 - hidden) exp(match) + hidden) at the nodes (method.md, eq. 5)."""
+    """Return log((1 - hidden) exp(match) + hidden) at the nodes (method, eq. 4.3)."""
     table = np.empty(TABLE_STEPS + 1, dtype=np.float32)
     for k in range(TABLE_STEPS + 1):
         match = TABLE_LOW + k * (TABLE_HIGH - TABLE_LOW) / TABLE_STEPS
@@ -245,7 +245,7 @@ def normal_agreement(transformed, looked_up, j):
 
 @njit(cache=True, inline="always")
 def depth_below(transformed, parameters, j):
-    """Return the depth of a transformed point below the support, beyond the clearance (method.md, eq. 21), in sd."""
+    """Return the depth of a transformed point below the support, beyond the clearance (method, eq. 4.5), in sd."""
     support = parameters.support
     height_m = (
         support[0] * transformed[X, j]
@@ -259,7 +259,7 @@ def depth_below(transformed, parameters, j):
 
 @njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
 def sum_over_points(points, transformed, looked_up, parameters):
-    """Return the log-likelihood of transformed points, and the number explained (method.md, eq. 5, 6 and 21).
+    """Return the log-likelihood of transformed points, and the number explained (method, eq. 4.3 to 4.5).
 
     All cases are evaluated for every point, and one is selected: code without branches is vectorised.
 
@@ -278,7 +278,7 @@ def sum_over_points(points, transformed, looked_up, parameters):
         agreement = normal_agreement(transformed, looked_up, j)
         variance = points[VARIANCE_M2, j] + looked_up[VARIANCE, j] + parameters.blur_m * parameters.blur_m
         half_square = HALF * in_front * in_front / variance
-        # With the expected deficit due to the fixed pattern, which is the same in both views (eq. 27).
+        # With the expected deficit due to the fixed pattern, which is the same in both views (eq. 4.9).
         misfit = half_square + HALF * transformed[PATTERN, j]
         match = parameters.typical_misfit - misfit - parameters.normal_cost * (ONE - agreement)
         matches = (half_square < MATCH_LIMIT) & (agreement > MIN_AGREEMENT)
@@ -333,7 +333,7 @@ def classify(pose, projection, parameters):
 def residual_excess(pose, projection, rims, blur_m):
     """Return the equations for the excess of squared residuals over their variances under one pose (12,).
 
-    Least squares for b² and the variance of errors near silhouettes (method.md, eq. 8 and 31), over the points that
+    Least squares for b² and the variance of errors near silhouettes (method, eq. 4.7 and 4.8), over the points that
     face the camera and are within `LOOSE_SIGMAS` standard deviations.
 
     Args:

@@ -12,7 +12,7 @@ LOG_LIKELIHOOD, EXPLAINED, PRODUCT, OWN_SQUARE, OTHER_SQUARE, MATCHES = 0, 1, 2,
 
 
 def scores(poses, forward, backward, forward_parameters, backward_parameters, colours=(NO_COLOURS, NO_COLOURS)):
-    """Return the scores of poses, summed over the points of two views (method.md, eq. 3 and 19).
+    """Return the scores of poses, summed over the points of two views (method, eq. 4.1 and 7.3).
 
     In single precision, the error is below 1e-4 nats per point unless a point falls within 1e-3 px of a pixel's border.
 

@@ -6,7 +6,7 @@ camera_from_object, and `intrinsics` (f, 4) are fx, fy, cx, cy of the stacked im
 the object frame.
 
 A view that sees a surface within the truncation band along a voxel's pixel votes with the voxel's distance above that
-surface along its normal, a weight, and the index of the surface point. Equation numbers are those of docs/method.md.
+surface along its normal, a weight, and the index of the surface point. Equations are those of docs/method/fusion.md.
 """
 
 import math
@@ -67,7 +67,7 @@ def between(image, column, row, channel):
 def integrate(
     blocks, origin, voxel_m, tau_m, empty_weight, views, index, free_m, poses, intrinsics, points, normals, weights
 ):
-    """Return signed distance and weight of the voxels of some blocks, each (b, SIDE, SIDE, SIDE) float32 (F5).
+    """Return signed distance and weight of the voxels of some blocks, each (b, SIDE, SIDE, SIDE) float32 (eq. 12.5).
 
     Distances are positive outside and truncated to ±`tau_m`; weight 0 = unobserved. Values are at voxel centres:
     origin + (index + ½) voxel_m.
@@ -158,7 +158,7 @@ def collect_votes(positions, tau_m, index, free_m, poses, intrinsics, points, no
             if abs(along) <= tau_m:
                 k = seen[voxel]
                 distance[voxel, k], number[voxel, k] = along, n
-                # (F5): the extrapolation behind a surface fades out with depth.
+                # eq. 12.5: the extrapolation behind a surface fades out with depth.
                 weight[voxel, k] = weights[n] * min(1.0, 1.5 * (1.0 + along / tau_m) + 1e-3)
                 seen[voxel] = k + 1
             elif along > 0.0 and depth < free_m[f, row, column] - tau_m:
@@ -167,7 +167,7 @@ def collect_votes(positions, tau_m, index, free_m, poses, intrinsics, points, no
 
 
 def observe(queries, directions, tolerance_m, tau_m, *views):
-    """Return the observations of oriented points by the views (F7 to F9).
+    """Return the observations of oriented points by the views (eq. 12.7, 12.8 and 12.10).
 
     A view supports a point if it sees a surface within `tolerance_m` along the same pixel that faces the same way.
     Colours are averaged over the supporting views.
@@ -232,7 +232,7 @@ def _observe(
             left, top = math.floor(u), math.floor(v)
             if gains[f, 3] == 0.0 or left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
                 continue
-            share = gains[f, 3] * colour_weights[n] ** focus  # (F9)
+            share = gains[f, 3] * colour_weights[n] ** focus  # eq. 12.10
             colours[q, 3] += share
             turned = harmonics(poses[f], normals[n, 0], normals[n, 1], normals[n, 2])
             for c in range(3):
@@ -309,7 +309,7 @@ def facing(first, i, second, k):
 def fuse_votes(
     position, seen, distance, weight, number, emptiness, tau_m, views, index, poses, intrinsics, points, normals
 ):
-    """Return the signed distance and weight of a position from its votes (F6). Weights of rejected votes become 0.
+    """Return the signed distance and weight of a position from its votes (eq. 12.6). Rejected votes get weight 0.
 
     Only votes on the same side of the object as the dominant vote are averaged. A side is rejected if most votes see
     surface between it and its view: a few pixels at grazing angles, with errors along their rays far beyond the noise,
@@ -369,7 +369,7 @@ def dominant_vote(seen, distance, weight, number, normals, tau_m):
     """
     best, best_score = -1, 0.0
     for k in range(seen):
-        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)  # (F6)
+        score = weight[k] * (1.01 - abs(distance[k]) / tau_m)  # eq. 12.6
         if score > best_score:
             best, best_score = k, score
     if best < 0 or distance[best] >= 0.0:

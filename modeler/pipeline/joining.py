@@ -2,7 +2,7 @@
 
 If an object is laid down differently or regrasped, the motion prior does not hold across the gap: its bottom has
 changed, and single views before and after may share little surface. So the models fused from the views before and
-after are aligned from all initial rotations, and alignments are scored by all pairs of views (method.md, "Segments").
+after are aligned from all initial rotations, and alignments are scored by all pairs of views (docs/method/segments.md).
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Joiner:
         """Return whether views of two segments contradict each other no more than those of one segment do.
 
         The tolerance is the chance deviation of the misfits of independent measurements, as many as a pair has for each
-        view of the smaller segment (method.md, eq. J2).
+        view of the smaller segment (method, eq. 11.2).
         """
         own = [self._own_log_likelihood(segment) for segment in (target, source) if len(segment.frames) > 1]
         count = min(_MAX_VIEWS, len(target.frames), len(source.frames))
@@ -131,7 +131,7 @@ class Joiner:
         return alignment.log_likelihood >= float(np.mean(own or [0.0])) - allowed
 
     def likelihoods(self, target: Segment, source: Segment, poses: Array) -> Array:
-        """Return the log-likelihoods (n,) of alignments (n, 4, 4), means over all pairs of views (eq. J1), in nats."""
+        """Return the log-likelihoods (n,) in nats of alignments (n, 4, 4), means over pairs of views (eq. 11.1)."""
         targets, sources = self._spread(target, _MAX_VIEWS), self._spread(source, _MAX_VIEWS)
         log_likelihoods = [
             self._nats(other, view, se3.inverse(target.solution.trajectory[t]) @ poses @ source.solution.trajectory[s])
@@ -218,7 +218,7 @@ class Joiner:
         return tuple(edges)
 
     def _judged(self, posterior: Posterior, views: tuple[RayImage, RayImage], guess: Array) -> Edge:
-        """Return the posterior as an edge, accepted if it is usable, near the guess, and passes eq. 22.
+        """Return the posterior as an edge, accepted if it is usable, near the guess, and passes eq. 6.5.
 
         The guess is one of very many alignments, some of which match by chance: the images must not contradict it.
         """
@@ -231,7 +231,7 @@ class Joiner:
         sigma_rad, _ = widest_rotation(posterior)
         if sigma_rad > _OPEN_SHARE * _ALIGNMENT_SIGMA_RAD:
             return Edge(posterior, "join", False, OpenRotation(float(np.degrees(sigma_rad))))
-        if not pair.fits(posterior.pose.mean, self._search.fine_m(pair)):  # method.md, eq. 22
+        if not pair.fits(posterior.pose.mean, self._search.fine_m(pair)):  # method, eq. 6.5
             return Edge(posterior, "join", False, Failed(Outcome.NO_OVERLAP))
         return Edge(posterior, "join", True, JoinsSegments(1.0, 0.0))
 

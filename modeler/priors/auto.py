@@ -16,7 +16,7 @@ _TABLE_PROBABILITY = 0.5  # even odds; motion on a table is about 12 nats denser
 
 @dataclass(frozen=True)
 class AutoPrior(AbstractPrior):
-    """A mixture of free motion and motion on the table, if the views show one (method.md, eq. 28).
+    """A mixture of free motion and motion on the table, if the views show one (method, eq. 3.3).
 
     If the images agree with motion on the table, the posterior is that of the table prior; if they contradict it, as
     for an object that is lifted, it is that of free motion.

@@ -24,7 +24,7 @@ class HeldPrior(AbstractPrior):
     pose, whose uncertainty grows with their distance.
 
     Between two frames the hand may have regrasped the object. Then its motion is uninformative, and the prior is
-    `regrasped`; the images decide (method.md, eq. 26).
+    `regrasped`; the images decide (method, eq. 3.5).
     """
 
     hand: HandPoses
@@ -70,7 +70,7 @@ class HeldPrior(AbstractPrior):
         if self.previous is None or target.index == self.previous:
             regrasped = self.regrasped.between(source, target)
             probability = 1.0 - (1.0 - self.regrasp_probability) ** self.steps
-            known = Alternatives((moved, regrasped), np.array([1.0 - probability, probability]))  # method.md, eq. 26
+            known = Alternatives((moved, regrasped), np.array([1.0 - probability, probability]))  # method, eq. 3.5
             return defensive_mixture(known, [regrasped], _REGRASPED_SHARE)
         # The hand's motion to an earlier view is already part of the edges in between; here it is only a proposal,
         # within limits about it or, after a regrasp, about zero motion; weights by volume make the density uniform.

@@ -72,7 +72,7 @@ class BackgroundColour:
         return cls(window, mean, sigma, known, _object_density(colours[deep], behind))
 
     def shown(self, colour: npt.NDArray[np.uint8], mask: BoolArray) -> BoolArray:
-        """Return the pixels of a mask (h, w) that show the background rather than the object (method.md, eq. B1).
+        """Return the pixels of a mask (h, w) that show the background rather than the object (method, eq. 2.2).
 
         Args:
             colour: (h, w, 3) RGB.

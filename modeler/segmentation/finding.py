@@ -192,7 +192,7 @@ def _many(ends: BoolArray, labels: Labels) -> BoolArray:
 
 
 def _arm(part: _Part, scene: Scene, zone_m: Array) -> BoolArray:
-    """Return the pixels (h, w) of an arm that may touch the object (method.md, "Occluders").
+    """Return the pixels (h, w) of an arm that may touch the object (docs/method/segmentation.md).
 
     It leads out of view, or out of where the object may be, and is nearer than the object ever was; where arms are in
     most frames, it may also be what leads out of view above the support.

@@ -1,4 +1,4 @@
-"""What to do next: the most informative view, turn or poke (docs/method.md, "What to do next")."""
+"""What to do next: the most informative view, turn or poke (docs/method/suggestion.md)."""
 
 from modeler.suggestion.belief import Belief as Belief
 from modeler.suggestion.belief import Prediction as Prediction

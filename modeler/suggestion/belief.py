@@ -36,7 +36,7 @@ from modeler.types import (
 
 _POINTS: Final = 1500  # of a view, used to evaluate its surface
 _BIN_RAD: Final = np.radians(15.0)  # half of a turn that changes visibility much
-_JOINED: Final = 0.85  # 17 of 20 recordings with a turned-over object gave one right model (docs/method.md)
+_JOINED: Final = 0.85  # 17 of 20 recordings with a turned-over object gave one right model (docs/method/suggestion.md)
 _LEAST_MASS: Final = 0.03  # of a bin of turns that is evaluated
 _SPAN_STEPS: Final = 4  # number of steps whose prior limits apply to closures
 
@@ -294,7 +294,7 @@ class Belief:
         return float(new / max(shown.surface.sum(), 1e-9))
 
     def surface_nats(self, shown: Shown, covariance: Array) -> float:
-        """Return by how much the entropy of the surface falls if a view sees some cells (docs/method.md, eq. N5).
+        """Return by how much the entropy of the surface falls if a view sees some cells (method, eq. 14.5).
 
         Args:
             shown: the cells.

@@ -118,7 +118,7 @@ class EdgePredictor:
     likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
     """That of the registration."""
     noise_m: float = 0.0
-    """Noise b of matching surfaces (method.md, eq. 8), the median of the edges so far."""
+    """Noise b of matching surfaces (method, eq. 4.7), the median of the edges so far."""
     scale: float = USUAL_SCALE
     """Actual over predicted information of the edges so far."""
     colour: ColourInformation | None = None
@@ -134,7 +134,7 @@ class EdgePredictor:
         *,
         axis: tuple[Array, Array],
     ) -> EdgePredictor:
-        """Return the predictor with noise and scale from the newest edges (method.md, eq. N4).
+        """Return the predictor with noise and scale from the newest edges (method, eq. 14.4).
 
         One typical edge is added, which is the prior before the first edge.
 
@@ -183,9 +183,9 @@ class EdgePredictor:
         return replace(self, noise_m=float(np.median(noises_m)), scale=float(np.exp(np.mean(scales))), colour=colour)
 
     def independent(self, patches: float) -> float:
-        """Return the number of independent measurements in a pair's points (method.md, eq. N3).
+        """Return the number of independent measurements in a pair's points (method, eq. 14.3).
 
-        n of the tempered likelihood (eq. 7), and those of the refinement (eq. 14) with residuals as predicted.
+        n of the tempered likelihood (eq. 4.6), and those of the refinement (eq. 6.1) with residuals as predicted.
         """
         tempered = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / patches)
         return tempered + visible_share(patches / 2**Refiner.halvings) * patches
@@ -260,7 +260,7 @@ class EdgePredictor:
         costs = [np.exp(-share / self.likelihood.overlap_scale) for share in (sums[:, 1], alike)]
         costs = [self.likelihood.no_overlap_cost * cost for cost in costs]
         looks = np.logaddexp(-costs[0], -costs[1]) - np.log(2.0)
-        log_likelihoods = independent * sums[:, 0] + looks  # method.md, eq. 7 and N7
+        log_likelihoods = independent * sums[:, 0] + looks  # method, eq. 4.6 and 14.7
         return poses, log_likelihoods, density.log_density(poses), float(sums[_TRUE, 1])
 
     def _confusable_share(self, source: PredictedView, poses: Array) -> Array:
@@ -333,7 +333,7 @@ def matched(
         for normals in (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
     )
     weights = used[:, point_to_plane.WEIGHT]
-    product = (own.T * weights) @ other  # method.md, J of eq. 14: the noise of independent normals averages out
+    product = (own.T * weights) @ other  # method, J of eq. 6.1: the noise of independent normals averages out
     tangent = np.eye(3) - own[:, 3:, None] * own[:, None, 3:]
     levers = np.concatenate([se3.hat(arms) / scale_m @ tangent, tangent], axis=1)
     product = product - normal_variance * np.einsum("n,nik,njk->ij", weights, levers, levers)

@@ -2,7 +2,7 @@
 
 Errors are those of object coordinates, δ_k with true object_from_camera(k) = exp(δ_k) object_from_camera(k): an edge
 with covariance Σ measures δ_source − δ_target with the information Ω = Adᵀ Σ⁻¹ Ad, Ad that of source_from_object
-(docs/method.md, eq. N1).
+(method, eq. 14.1).
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class PoseGraphBelief:
         return self._columns[other][row : row + 6]
 
     def gain(self, edges: Sequence[tuple[int, Array]], new: int) -> Gain:
-        """Return the information gain of edges between a new frame and others (docs/method.md, eq. N2).
+        """Return the information gain of edges between a new frame and others (method, eq. 14.2).
 
         Args:
             edges: frame and information (6, 6) of the edge between it and the new frame, see `edge_information`.

@@ -31,7 +31,7 @@ _RIDGE = 1e-3  # where neighbours lie on a line
 _ALIKE = np.cos(np.radians(50.0))  # between normals of one face: edges stay
 _SURFACE_WITHIN, _SURFACE_BEYOND = 1.15, 0.24
 """Cells of new surface that a view shows per cell of hidden space seen head-on, fitted to 48 shapes of the tuning half
-(docs/method.md). Slanted surface is larger than the area that it covers in a view."""
+(docs/method/suggestion.md). Slanted surface is larger than the area that it covers in a view."""
 _STEPS = 24  # of 15°: turns that determine the visible surface
 
 
@@ -169,7 +169,7 @@ class SurfaceCells:
 
         The second is the expected surface there in cells, 1 for observed surface. For hidden space it depends on how
         much of the view a cell covers, and on whether surface is expected there: in front of the back of observed
-        surface, or as near to the axis as observed surface at that height (method.md, eq. N5).
+        surface, or as near to the axis as observed surface at that height (method, eq. 14.5).
         """
         points_m = se3.transform(camera_from_object, self.points_m)
         normals = self.normals @ camera_from_object[:3, :3].T

@@ -24,7 +24,7 @@ class PoseGaussian:
     """(6, 6) of ξ: rotation in rad first, then translation in m."""
     by_focal: Array = field(default_factory=lambda: np.zeros(6))
     """(6,) derivative of ξ by the logarithm of the camera's focal length, common to all images and not observable from
-    one (method.md, eq. 25); 0 if unknown. The covariance is conditional on the focal length."""
+    one (method, eq. 10.2); 0 if unknown. The covariance is conditional on the focal length."""
 
     def inverse(self) -> PoseGaussian:
         """Return the Gaussian of the inverse motion."""

@@ -284,7 +284,7 @@ def spread_of_positions(views: Mapping[int, RayImage], solution: Solution, facto
 
 
 def _of_common_shift(solution: Solution, frame: int) -> Array:
-    """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method.md, eq. G10)."""
+    """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method, eq. 8.10)."""
     if solution.common_shift_m2 is None:
         return np.zeros((3, 3))
     left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the pose of the graph's root is the identity
@@ -302,7 +302,7 @@ def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, fr
     focal = solution.focal
     if focal is None or frame not in focal.by_focal:
         return 0.0, 0.0
-    moved = focal.sigma * focal.by_focal[frame]  # of object coordinates (eq. G14)
+    moved = focal.sigma * focal.by_focal[frame]  # of object coordinates (eq. 10.6)
     place_m = se3.transform(solution.trajectory[frame], views[frame].centroid_m[None])[0]
     shift_m = moved[3:] + np.cross(moved[:3], place_m)
     return float(np.degrees(np.linalg.norm(moved[:3]))), float(np.linalg.norm(shift_m))

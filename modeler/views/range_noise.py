@@ -1,8 +1,8 @@
 """Noise statistics of a depth camera from planes around the object: tables, floors, walls.
 
 A plane is linear in inverse depth, so the residual of a plane fitted to a tile of the image is noise. Its
-autocorrelation gives the area over which errors are correlated (method.md, eq. 23), and the same tile in two frames the
-fixed-pattern share, such as that of a projected pattern or the lens (eq. 27).
+autocorrelation gives the area over which errors are correlated (method, eq. 1.4), and the same tile in two frames the
+fixed-pattern share, such as that of a projected pattern or the lens (eq. 4.9).
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage
 from modeler.views.range_noise import RangeNoise
 from modeler.views.sparsity import closed, gap_px, measured_share, nearest_depth
 
-_ALIKE = 2.0  # areas of correlated noise that err alike: measured, see method.md
-_RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen to 1/e: measured, see method.md
+_ALIKE = 2.0  # areas of correlated noise that err alike: measured
+_RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen to 1/e: measured
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Sensor:
 
     Smoothing over a ball of radius r displaces a surface whose radius of curvature is about the extent by r² / extent,
     away from the camera, so that the image of a turning object lags behind it. With this radius the displacement is the
-    same share of the noise, whatever the noise (method.md, eq. 1).
+    same share of the noise, whatever the noise (method, eq. 1.1).
     """
     min_neighbours: float = 25.0
     """The ball grows until it holds about this many pixels of a surface that faces the camera."""
@@ -151,7 +151,7 @@ class Sensor:
     def _smoothing(
         self, frame: Frame, measured: BoolArray, outline: BoolArray
     ) -> tuple[planes.Ball, float, tuple[float, float]]:
-        """Return how an object is smoothed (method.md, eq. 1 and 2).
+        """Return how an object is smoothed (method, eq. 1.1 and 1.2).
 
         Args:
             frame: with the depth.
@@ -171,7 +171,7 @@ class Sensor:
         extent_m = metres_per_px * float(np.hypot(np.ptp(rows), np.ptp(columns)))
         density = rows.size / float(outline.sum())
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
-        # method.md, eq. 1; no more noise than stated, as unevenness of planes adds to theirs
+        # method, eq. 1.1; no more noise than stated, as unevenness of planes adds to theirs
         known = math.isfinite(self.pixel_sigma_inverse_per_m)
         pixel_m = self.pixel_sigma_inverse_per_m * middle_m**2 if known else self.sigma_r_m
         noise_m = min(pixel_m, self.sigma_r_m)
@@ -180,7 +180,7 @@ class Sensor:
         # A stride of 2 px is enough where a wide window holds many pixels.
         enough = np.pi * reach_px**2 * density > 8.0 * self.min_neighbours
         ball = planes.Ball(radius_m, reach_px, 2 if reach_px > 4 and enough else 1, pixel_m)
-        # method.md, eq. 23
+        # method, eq. 1.4
         ball_px = np.pi * (radius_m / metres_per_px) ** 2
         sharing = max(density * (ball_px + _ALIKE * self.noise_area_px), 1.0)
         # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
@@ -188,7 +188,7 @@ class Sensor:
 
 
 def rim_weights(outline: BoolArray) -> np.ndarray:
-    """Return the weights (h, w) float32, 0 to 1, of errors near the silhouette of an object (method.md, eq. 31).
+    """Return the weights (h, w) float32, 0 to 1, of errors near the silhouette of an object (method, eq. 4.8).
 
     Args:
         outline: (h, w) bool, the object's pixels. The edge of the image is no silhouette.

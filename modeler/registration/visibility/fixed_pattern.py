@@ -1,4 +1,4 @@
-"""Fixed-pattern noise: errors that a pixel repeats from frame to frame (method.md, eq. 27).
+"""Fixed-pattern noise: errors that a pixel repeats from frame to frame (method, eq. 4.9).
 
 Errors of the camera stay in place while the object turns, as shading does in colours. Two views then agree best at zero
 motion: a smooth body of revolution would be estimated not to have turned, with a small covariance.
@@ -45,7 +45,7 @@ class FixedPattern:
         return self.share * self._correlation(matches[:, point_to_plane.SHIFT]) ** 2
 
     def derivatives(self, matches: Array, camera: Camera) -> tuple[Array, Array]:
-        """Return first and second derivatives of f c / 2 (eq. 27) by the positions of matches.
+        """Return first and second derivatives of f c / 2 (eq. 4.9) by the positions of matches.
 
         Args:
             matches: (n, 15) of `point_to_plane.matches`.

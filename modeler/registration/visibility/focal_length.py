@@ -1,4 +1,4 @@
-"""The focal length as a nuisance parameter of a pair, sampled with the pose (method.md, eq. 25 and 29)."""
+"""The focal length as a nuisance parameter of a pair, sampled with the pose (method, eq. 10.1 and 10.2)."""
 
 from __future__ import annotations
 

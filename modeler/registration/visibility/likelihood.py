@@ -29,7 +29,7 @@ _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' la
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
-_TAIL = 0.01  # probability of rejecting a true pose by eq. 22
+_TAIL = 0.01  # probability of rejecting a true pose by eq. 6.5
 MISFIT = 0.5  # mean of r² / 2τ² if variances are right
 
 
@@ -41,7 +41,7 @@ class Scores(NamedTuple):
     explained: Array
     """(n,) fractions E of points explained by matching surface."""
     colours: Array
-    """(n,) log-likelihoods of the colours of matching surface (method.md, eq. 19); 0 if they are not compared."""
+    """(n,) log-likelihoods of the colours of matching surface (method, eq. 7.3); 0 if they are not compared."""
 
 
 class MatchNoise(NamedTuple):
@@ -70,7 +70,7 @@ class VisibilityLikelihood:
     hidden_share: float = 0.5
     """Prior probability η that a point that faces the other camera is hidden by another part of the object."""
     holes: bool = True
-    """Whether points that should be seen where nothing was measured are evidence (method.md, eq. 6)."""
+    """Whether points that should be seen where nothing was measured are evidence (method, eq. 4.4)."""
     max_point_cost: float = 10.0
     """Upper bound K (nats) of the cost of one point."""
     normal_cost: float = 2.0
@@ -123,14 +123,14 @@ class DirectedLikelihood:
     pattern: FixedPattern
     """Errors common to both views."""
     rim_m: float = 0.0
-    """Standard deviation of depth errors near silhouettes in m (method.md, eq. 31)."""
+    """Standard deviation of depth errors near silhouettes in m (method, eq. 4.8)."""
 
     def classify(self, pose: Array, blur_m: float = 0.0) -> np.ndarray:
         """Return the class (n,) of each point under one pose (12,): `point_likelihood.classify`."""
         return point_likelihood.classify(pose, self.projection(1), self.parameters(blur_m))
 
     def residual_excess(self, pose: Array, blur_m: float) -> Array:
-        """Return the sums (3, 3) for eq. 8 and 31 of method.md over matches under a pose (12,)."""
+        """Return the sums (3, 3) for eq. 4.7 and 4.8 of the method over matches under a pose (12,)."""
         least_m = float(np.hypot(blur_m, self._min_blur_m))
         return point_likelihood.residual_excess(pose, self.projection(1), self.points[:, OWN_RIM], least_m)
 
@@ -157,7 +157,7 @@ class DirectedLikelihood:
         return self._projections[stride]
 
     def parameters(self, blur_m: float, typical_misfit: float = MISFIT) -> LikelihoodParameters:
-        """Return the parameters of the kernel for surfaces with a blur, see method.md, eq. 4 to 6 and 21."""
+        """Return the parameters of the kernel for surfaces with a blur, see the method, eq. 4.2 to 4.5."""
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
         missing = max(self.model.hidden_share, 1.0 - self.image.measured_share) if self.model.holes else 1.0
@@ -201,7 +201,7 @@ class DirectedLikelihood:
         return float(np.hypot(detail_m, self.model.surface_noise * self.image.sigma_r_m))
 
     def _support(self, blur_m: float) -> np.ndarray:
-        """Return the support plane for the kernel, for surfaces with a blur (method.md, eq. 21)."""
+        """Return the support plane for the kernel, for surfaces with a blur (method, eq. 4.5)."""
         plane = self.image.plane
         if plane is None:
             return np.zeros(5, dtype=np.float32)
@@ -215,7 +215,7 @@ class DirectedLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class PairLikelihood:
-    """p(surface of source | image target, T) · p(surface of target | image source, T) (method.md, eq. 3)."""
+    """p(surface of source | image target, T) · p(surface of target | image source, T) (method, eq. 4.1)."""
 
     forward: DirectedLikelihood
     """The source's points looked up in the target."""
@@ -258,7 +258,7 @@ class PairLikelihood:
 
     @property
     def temper(self) -> float:
-        """Fraction n / N of independent measurements in the points (method.md, eq. 7).
+        """Fraction n / N of independent measurements in the points (method, eq. 4.6).
 
         Smoothing and the sensor's correlated noise limit n to the number of patches; errors common to distant points
         limit it on an object that covers much of the image.
@@ -310,7 +310,7 @@ class PairLikelihood:
         stride: int = 1,
         log_focal: Array | None = None,
     ) -> Array:
-        """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method.md, eq. 7).
+        """Return tempered log-likelihoods (n,) of poses (n, 4, 4) (method, eq. 4.6).
 
         Args:
             poses: target_from_source.
@@ -341,7 +341,7 @@ class PairLikelihood:
         return MatchNoise(surface_m, float(correlations(found)[0]), band)
 
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
-        """Return the misfit μ at which matches under a good pose (4, 4) contribute 0 on average (method.md, eq. 8).
+        """Return the misfit μ at which matches under a good pose (4, 4) contribute 0 on average (method, eq. 4.7).
 
         The predicted noise of points and planes is not exact. If too large, it would reward every match, and bias the
         spin of a can towards the largest overlap.
@@ -365,7 +365,7 @@ class PairLikelihood:
     def noises_m(self, pose: Array, blur_m: float) -> tuple[float, float]:
         """Return the noise b of matching surfaces, beyond that of points and planes, and that near silhouettes, in m.
 
-        Nuisance parameters at their most likely values given a pose (4, 4) (method.md, eq. 8 and 31): the effect of
+        Nuisance parameters at their most likely values given a pose (4, 4) (method, eq. 4.7 and 4.8): the effect of
         smoothing on curved surfaces, sensor noise common to neighbours, and depth flattened near outlines, if that is
         significant. `blur_m` is the value of b at which matches are selected, and returned with too few of them.
         """
@@ -377,7 +377,7 @@ class PairLikelihood:
         return max(math.sqrt(surface_m2), _ROUNDING_M), math.sqrt(rim_m2)
 
     def with_rim_m(self, rim_m: float) -> PairLikelihood:
-        """Return the pair with this standard deviation of depth errors near silhouettes in m (eq. 31)."""
+        """Return the pair with this standard deviation of depth errors near silhouettes in m (eq. 4.8)."""
         if rim_m == self.forward.rim_m == self.backward.rim_m:
             return self  # with its cached projections
         return replace(self, forward=replace(self.forward, rim_m=rim_m), backward=replace(self.backward, rim_m=rim_m))
@@ -404,7 +404,7 @@ class PairLikelihood:
         return float(matched / max(matched + wrong, 1))
 
     def fits(self, target_from_source: Array, blur_m: float) -> bool:
-        """Return whether the images contradict a pose (4, 4) no more than 99 of 100 true ones (method.md, eq. 22).
+        """Return whether the images contradict a pose (4, 4) no more than 99 of 100 true ones (method, eq. 6.5).
 
         `blur_m` is the blur at which matches are selected, and the least noise of surfaces.
         """
@@ -468,7 +468,7 @@ class PairLikelihood:
         return stride * (self.temper * of_surface + of_colours)
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
-        """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method.md, eq. 10)."""
+        """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method, eq. 5.2)."""
         regulariser = _per_point(regulariser, _DESCENT_STRIDE)
         band = 0 if self.colour is None else self.colour.band(blur_m)
         colours, weight = self._colours(band, _DESCENT_STRIDE), np.float32(weight_of(ASSUMED_RHO))

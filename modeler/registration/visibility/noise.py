@@ -1,4 +1,4 @@
-"""Variances of matching surface from squared residuals (method.md, eq. 8 and 31)."""
+"""Variances of matching surface from squared residuals (method, eq. 4.7 and 4.8)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The likelihood of a pair's colours: the correlation of print on matching surface (method.md, eq. 17 to 20).
+"""The likelihood of a pair's colours: the correlation of print on matching surface (method, eq. 7.1 to 7.4).
 
 Lights are fixed to the camera while the object turns: shading moves over the surface, and exposure and white balance
 drift. Both are multiplicative, and shading is smooth, so that the band-passed logarithm of a colour contains the print
@@ -69,7 +69,7 @@ class PairColour:
         return int(np.clip(np.round(np.log2(max(blur_px / FINEST_PX, 1.0))), 0, BANDS - 1))
 
     def log_likelihoods(self, scored: Array, band: int, max_independent: float, *, stride: int) -> Array:
-        """Return log L_c (n,) in nats: colours of matching surface against independent ones (method.md, eq. 19).
+        """Return log L_c (n,) in nats: colours of matching surface against independent ones (method, eq. 7.3).
 
         Args:
             scored: (n, 6) `scores.scores` of poses, with the colours of a band.
@@ -88,7 +88,7 @@ class PairColour:
         return self.independent(band, max_independent) * rho / (1.0 - rho**2)
 
     def independent(self, band: int, max_independent: float) -> float:
-        """Return the number of independent features if all surface matches (method.md, eq. 19)."""
+        """Return the number of independent features if all surface matches (method, eq. 7.3)."""
         return (1.0 - self.static_correlation(band) ** 2) / (1.0 / max_independent + 1.0 / self.patches(band))
 
     def scored_band(self, blur_m: float) -> int:
@@ -149,7 +149,7 @@ class PairColour:
         )
 
     def _regressed(self, band: int) -> tuple[_Features, _Features]:
-        """Return the features of all points of source and target in a band, without static ones (eq. 18)."""
+        """Return the features of all points of source and target in a band, without static ones (eq. 7.2)."""
         if band not in self._residuals:
             forward, backward = self._partners
             share = max(self.static_correlation(band), 0.0)
@@ -165,7 +165,7 @@ class PairColour:
         return points / (4.0 * np.pi * (FINEST_PX * 2**band) ** 2)
 
     def static_correlation(self, band: int) -> float:
-        """Return ρ₀, the correlation of features at the same place of both views (method.md, eq. 18).
+        """Return ρ₀, the correlation of features at the same place of both views (method, eq. 7.2).
 
         Features that stay in place while the object turns are effects of light: highlights, shading, fixed patterns.
         """
@@ -199,7 +199,7 @@ def correlations(scored: Array) -> Array:
 
 
 def without_shift(equations: Array, shifts: Array) -> Array:
-    """Return the matrices K (..., 6, 6) that eliminate unknown shifts from equations (method.md, eq. 24).
+    """Return the matrices K (..., 6, 6) that eliminate unknown shifts from equations (method, eq. 7.5).
 
     Args:
         equations: (..., 6, 6) normal equations of colours.
@@ -210,7 +210,7 @@ def without_shift(equations: Array, shifts: Array) -> Array:
 
 
 def weight_of(correlation: float) -> float:
-    """Return the weight of squared differences of features of unit variance (method.md, eq. 20)."""
+    """Return the weight of squared differences of features of unit variance (method, eq. 7.4)."""
     square = float(np.clip(correlation, 0.0, _MAX_CORRELATION)) ** 2
     return square / (1.0 - square)
 
@@ -260,7 +260,7 @@ def _partners(points_m: Array, view: RayImage, other: RayImage, shift_px: np.nda
 def _regressed(
     view: RayImage, other: RayImage, partners: tuple[np.ndarray, np.ndarray], band: int, share: float
 ) -> _Features:
-    """Return a view's features in a band, regressed on the other view's at the same places (eq. 18).
+    """Return a view's features in a band, regressed on the other view's at the same places (eq. 7.2).
 
     Args:
         view: the view.
@@ -294,7 +294,7 @@ def view_features(view: RayImage) -> np.ndarray:
 
 
 def features(frame: Frame, pixels: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the features of surface points in bands of increasing width (method.md, eq. 17).
+    """Return the features of surface points in bands of increasing width (method, eq. 7.1).
 
     Args:
         frame: with its colour.

@@ -1,4 +1,4 @@
-"""Refinement of samples by the point-to-plane equations of matching surface (method.md, eq. 14 to 16).
+"""Refinement of samples by the point-to-plane equations of matching surface (method, eq. 6.1 to 6.3).
 
 A product over hundreds of points with common errors overstates the information, so that the sampled likelihood is
 tempered: adequate for directions that the images hardly determine, far too wide for those that they determine well. For
@@ -47,7 +47,7 @@ class Refiner:
         *,
         fine_m: float,
     ) -> Array:
-        """Return refined samples (n, 4, 4): those of posterior × matching surface, if both are Gaussian (eq. 16).
+        """Return refined samples (n, 4, 4): those of posterior × matching surface, if both are Gaussian (eq. 6.3).
 
         Each sample moves by its own Gauss-Newton step, scaled by the surface's information relative to the samples'
         spread, and a fraction of the surface's uncertainty (randomised maximum likelihood: Oliver, He and Reynolds
@@ -77,7 +77,7 @@ class Refiner:
         steps += there - _steps(pair, mode[None], noise, spread, stride=2)
         step = steps @ to_basis.T @ information
         scatter = rng.normal(size=steps.shape) @ root.T
-        moved = (step + scatter) @ narrowed.T @ basis.T  # method.md, eq. 16
+        moved = (step + scatter) @ narrowed.T @ basis.T  # method, eq. 6.3
         return se3.moved(samples.poses, moved, centre_m)
 
     def _information(
@@ -88,7 +88,7 @@ class Refiner:
         spread: Array,
         equations: tuple[Equations, Equations],
     ) -> tuple[Array, Array]:
-        """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method.md, eq. 14)."""
+        """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method, eq. 6.1)."""
         surface, colours = equations
         halvings = min(self.halvings, int(np.log2(max(len(surface.residuals) / self.min_matches, 1.0))))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
@@ -108,7 +108,7 @@ class Refiner:
 
 
 def first_order(pair: PairLikelihood, pose: Array, spread: Array, noise_m: float) -> FocalNuisance:
-    """Return how poses depend on the focal length, by a Gauss-Newton step under either of two (method.md, eq. 29).
+    """Return how poses depend on the focal length, by a Gauss-Newton step under either of two (method, eq. 10.1).
 
     Args:
         pair: the two views.
@@ -150,7 +150,7 @@ def shrunk(scores: Array, shape: Array) -> Array:
 
 
 def visible_share(size: float) -> float:
-    """Return the fraction of the variability in the scatter of patches of `size` balls (method.md, eq. 15).
+    """Return the fraction of the variability in the scatter of patches of `size` balls (method, eq. 6.2).
 
     Smoothing spreads a pixel's noise over a ball, across the border of a patch, and the scatter misses errors common to
     neighbouring patches. With patches of w² and balls of d², both square, a patch's sum weights the noise by a
@@ -232,7 +232,7 @@ class Equations(NamedTuple):
     """What an eliminated nuisance parameter explains."""
 
     def without(self, by_nuisance: Array) -> Equations:
-        """Return the equations after elimination of a parameter β ~ N(0, 1) (method.md, eq. 32).
+        """Return the equations after elimination of a parameter β ~ N(0, 1) (method, eq. 6.4).
 
         Args:
             by_nuisance: (n,) derivatives of the residuals by β.
@@ -245,7 +245,7 @@ class Equations(NamedTuple):
         return self._replace(by_own=own, by_other=other, explained=explained)
 
     def scatter(self, basis: Array, patches: IntArray, independent: float) -> tuple[Array, Array]:
-        """Return sensitivity (6, 6) and variability (6, 6) of the sum of the equations (method.md, eq. 14 and 15).
+        """Return sensitivity (6, 6) and variability (6, 6) of the sum of the equations (method, eq. 6.1 and 6.2).
 
         Args:
             basis: (6, 6) of ξ.

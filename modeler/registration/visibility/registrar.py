@@ -38,7 +38,7 @@ _LEAST_EFFORT = 0.25  # 0.5 s of 2 s for a pair without common surface
 
 @dataclass(frozen=True, eq=False)
 class ModeSamples:
-    """Samples of one mode, and the nuisance parameters (method.md, eq. 8) under which they were weighted."""
+    """Samples of one mode, and the nuisance parameters (method, eq. 4.7) under which they were weighted."""
 
     samples: WeightedSamples
     noise_m: float
@@ -53,7 +53,7 @@ class VisibilityRegistrar(AbstractRegistrar):
 
     p(surface of B | image A, T) · p(surface of A | image B, T), each a product over points, tempered because errors of
     neighbouring points are correlated. A search finds the modes, each is sampled and weighted, and directions that
-    matching surface determines well are refined (docs/method.md).
+    matching surface determines well are refined (docs/method/index.md).
     """
 
     likelihood: VisibilityLikelihood = field(default_factory=VisibilityLikelihood)
@@ -180,7 +180,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         at_limit: float,
         seconds: float,
     ) -> Posterior:
-        """Return the posterior of weighted modes, and its outcome (method.md, "Result")."""
+        """Return the posterior of weighted modes, and its outcome (docs/method/refinement.md)."""
         samples = np.concatenate([mode.poses for _, mode in weighted])
         weights = np.concatenate([share * mode.weights for share, mode in weighted])
         modes = tuple(
@@ -231,7 +231,7 @@ class VisibilityRegistrar(AbstractRegistrar):
 
 
 def comparable(modes: list[ModeSamples], pair: PairLikelihood) -> list[WeightedSamples]:
-    """Return the samples of modes with evidence that can be compared (method.md, eq. 13).
+    """Return the samples of modes with evidence that can be compared (method, eq. 5.6).
 
     All modes get the nuisance parameters of the one that matches best, as its own noise estimate would favour a mode
     that matches badly. Holes are left out: of modes that look alike, the one that moves less surface into shadows would
@@ -263,7 +263,7 @@ def overlapping(
     """Return the modes in which the views overlap, if the likeliest pose is in one of them; otherwise all modes.
 
     Without limits, views have nothing in common under most motions. The images cannot distinguish these, and their
-    volume would outweigh a precise match (method.md, "Weights of modes").
+    volume would outweigh a precise match (docs/method/search.md).
 
     Args:
         modes: samples of each mode.

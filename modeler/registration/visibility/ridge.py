@@ -1,4 +1,4 @@
-"""Likelihood along ridges, without what is chance (method.md, eq. 30)."""
+"""Likelihood along ridges, without what is chance (method, eq. 5.5)."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def by_halves(pair: PairLikelihood, poses: Array, blur_m: float, *, typical_misf
 
 
 def reliability(halves: Array) -> float:
-    """Return the share of the variance of sums that is no chance, from sums (m, 2, n) over halves (eq. 30).
+    """Return the share of the variance of sums that is no chance, from sums (m, 2, n) over halves (eq. 5.5).
 
     With r the correlation of the halves, that of their sum with another such sum is 2 r / (1 + r) (Spearman 1910; Brown
     1910).

@@ -137,7 +137,7 @@ class WeightedSamples:
         return self.nuisance.under(self.poses, self.log_focal)
 
     def conditional(self, centre_m: Array) -> WeightedSamples:
-        """Return samples given the focal length of the views, and how they depend on it (method.md, eq. 25).
+        """Return samples given the focal length of the views, and how they depend on it (method, eq. 10.2).
 
         What is left of this beyond first order is their regression on it.
 
@@ -183,7 +183,7 @@ class _Draws:
 
     @property
     def log_weights(self) -> Array:
-        """Log weights (n,); the mean of the weights is the evidence (method.md, eq. 12)."""
+        """Log weights (n,); the mean of the weights is the evidence (method, eq. 5.4)."""
         return self.log_target - self.log_density + np.log(len(self.poses))
 
     def reweighted(self, new: GaussianMixture) -> _Draws:
@@ -203,7 +203,7 @@ class _Draws:
 
 @dataclass(frozen=True)
 class AdaptiveSampler:
-    """Adaptive multiple importance sampling (Cornuet, Marin, Mira and Robert 2012; method.md, eq. 12).
+    """Adaptive multiple importance sampling (Cornuet, Marin, Mira and Robert 2012; method, eq. 5.4).
 
     Each round draws from a Gaussian with the moments of the weighted samples so far. All samples are weighted against
     the mixture of all proposals, so that a bad one costs samples, not correctness. While the weights are too uneven to

@@ -1,4 +1,4 @@
-"""Search for modes of the posterior: descent from many samples of the prior (method.md, eq. 9 to 11)."""
+"""Search for modes of the posterior: descent from many samples of the prior (method, eq. 5.1 to 5.3)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Candidates:
     scores: Array
     """(k,) tempered log-likelihoods (nats)."""
     spreads: Array
-    """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method.md, eq. 11)."""
+    """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method, eq. 5.3)."""
     open_rotation: bool = False
     """Whether the prior leaves the rotation open: by `OPEN_ROTATION_RAD` or more in every direction."""
     beyond_gain: float = -np.inf
@@ -74,7 +74,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Search:
-    """Finds candidates for the modes of a posterior, coarse to fine (method.md, "Search")."""
+    """Finds candidates for the modes of a posterior, coarse to fine (docs/method/search.md)."""
 
     basin: float = 0.2
     """Extent of a basin of attraction: rotation in rad, translation as a fraction of the object's size."""
@@ -112,7 +112,7 @@ class Search:
         return self.basin * np.repeat([1.0, pair.size_m], 3)
 
     def starts(self, pair: PairLikelihood, prior: PoseGaussian) -> int:
-        """Return the number of starts for the width of the prior, not limited by `max_starts` (method.md, eq. 9)."""
+        """Return the number of starts for the width of the prior, not limited by `max_starts` (method, eq. 5.1)."""
         extent = self.extent(pair)
         variances = np.linalg.eigvalsh(prior.covariance / np.outer(extent, extent))
         basins = np.sqrt(np.prod(np.maximum(variances, 1.0)))
@@ -205,7 +205,7 @@ class Search:
         return blur_m, MISFIT if open_rotation else pair.typical_misfit(best, blur_m)
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
-        """Return the regulariser of a descent: the prior's Gaussian, and damping (method.md, eq. 10).
+        """Return the regulariser of a descent: the prior's Gaussian, and damping (method, eq. 5.2).
 
         The likelihood is not tempered in descent, so that the Gaussian approximation of a uniform prior hardly biases
         directions that surface leaves open towards its mean.
@@ -243,6 +243,6 @@ def _is_open(prior: PoseGaussian) -> bool:
 
 
 def _spreads(pair: PairLikelihood, precisions: Array, poses: Array, blur_m: float) -> Array:
-    """Return roots (n, 6, 6) of covariances from matching surface and the prior's precisions (n, 6, 6) (eq. 11)."""
+    """Return roots (n, 6, 6) of covariances from matching surface and the prior's precisions (n, 6, 6) (eq. 5.3)."""
     precision = pair.curvatures(poses, blur_m, stride=_STRIDE) + precisions
     return np.asarray(np.linalg.cholesky(np.linalg.inv(precision)), dtype=np.float64)
