@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
@@ -14,6 +16,8 @@ from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.opening import open_sequence
 from modeler.sequences.survey import survey
 from modeler.types import Frame, InputError
+
+_log = logging.getLogger(__name__)
 
 END = "done"
 """A file of this name in the folder marks the end of the sequence."""
@@ -110,30 +114,48 @@ class WatchedSequence(AbstractDerived):
 
 
 def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Callable[[], bool]) -> Iterator[Frame]:
-    """Yield frames of ascending numbers, each once it is complete, until none has come for a while.
+    """Yield frames, each once it is complete, until none has come for a while.
+
+    They ascend, but for a frame that comes, or can be read, only after later ones. What can never be read is reported
+    to the log and left out, if there are other frames.
 
     Raises:
-        InputError: if the data at the end cannot be read.
+        InputError: if nothing can be read.
     """
-    last, state = -1, None
+    taken: set[int] = set()
+    failing: dict[int, float] = {}  # since when a frame cannot be read
+    faults: dict[int | None, InputError] = {}
+    state: object = None
     came_s = changed_s = time.monotonic()
     while not stop():
         now, before, state = time.monotonic(), state, _state(path)
         changed_s = changed_s if state == before else now
         ended = (path / END).exists()
         settled = ended or now - changed_s >= patience.settle_s
-        fault = None
+        faults = {}
         try:
-            for frame in _after(last, path, overrides, with_newest=settled):
-                yield frame
-                last, came_s = frame.index, time.monotonic()  # which the taker may have spent long with
-                if stop():
-                    return
-        except InputError as error:
-            fault = error  # half-written, perhaps
+            sequence = open_sequence(path, overrides)
+            indices = sequence.indices if settled else sequence.indices[:-1]
+        except InputError as error:  # half-written, perhaps
+            faults[None], indices = error, ()
+        for index in (index for index in indices if index not in taken):
+            try:
+                frame = sequence.frame(index)
+            except InputError as error:
+                faults[index] = error
+                if now - failing.setdefault(index, now) < patience.settle_s:
+                    break  # it may be being written
+                continue
+            yield frame
+            taken.add(index)
+            came_s = time.monotonic()  # which the taker may have spent long with
+            if stop():
+                return
         if time.monotonic() - max(came_s, changed_s) >= patience.idle_s or (ended and settled):
-            if fault is not None:
-                raise fault
+            for fault in faults.values():
+                if not taken:
+                    raise fault
+                _log.warning("%s: continuing with the frames so far", str(fault).rstrip("."))
             return
         time.sleep(POLL_S)
 
@@ -150,28 +172,22 @@ def watch(path: str | Path, overrides: Overrides | None = None, patience: WatchL
         first.append(frame.index)
     if not first:
         raise InputError(f"{path}: no frame has come in {patience.idle_s:g} s; start the program that writes them.")
-    seen = open_sequence(path, overrides).select(frames=slice(None, first[-1] + 1))
+    seen = open_sequence(path, overrides).select(frames=slice(None, max(first) + 1))
     survey(seen, truth=False)
     return WatchedSequence(seen, path, overrides, patience)
 
 
-def _after(last: int, path: Path, overrides: Overrides, *, with_newest: bool) -> Iterator[Frame]:
-    """Read the frames whose numbers follow `last`."""
-    sequence = open_sequence(path, overrides)
-    indices = sequence.indices if with_newest else sequence.indices[:-1]
-    return (sequence.frame(index) for index in indices if index > last)
-
-
 def _state(path: Path) -> object:
     """Return what changes when a file in a folder or in one of its folders is made, grows or goes."""
-    found = []
-    try:
-        for entry in os.scandir(path):
-            status = entry.stat()
-            found.append((entry.name, status.st_mtime_ns, status.st_size))
-            if entry.is_dir():
-                newest = max((inner.stat().st_mtime_ns for inner in os.scandir(entry.path)), default=0)
-                found.append((entry.name, newest, 0))
-    except OSError:
-        pass  # something went away between two looks
+    found: list[tuple[str, int, int]] = []
+    waiting = [(str(path), 1)]
+    while waiting:
+        folder, deeper = waiting.pop()
+        with suppress(OSError):  # it went away between two looks
+            for entry in os.scandir(folder):
+                with suppress(OSError):  # this alone did, or it is a link to nothing
+                    status = entry.stat()
+                    found.append((entry.path, status.st_mtime_ns, status.st_size))
+                    if deeper and entry.is_dir():
+                        waiting.append((entry.path, deeper - 1))
     return sorted(found)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from modeler.sequences import BopSequence, WatchLimits, open_sequence, watch, write_bop
+from modeler.sequences.watch import _state
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import small_frames, write_bundlesdf, write_tum
 
@@ -132,10 +133,64 @@ def test_nothing_or_nothing_readable_is_one_line(tmp_path: Path, frames: list[Fr
     with pytest.raises(InputError, match="no such folder"):
         watch(tmp_path / "nowhere", patience=brief)
     write_bop(tmp_path / "s", frames)
-    (tmp_path / "s" / "depth" / "000001.png").write_bytes(b"\x89PNG half")
-    with pytest.raises(InputError, match=r"000001\.png: is not a readable"):
+    for depth in (tmp_path / "s" / "depth").iterdir():
+        depth.write_bytes(b"\x89PNG half")
+    with pytest.raises(InputError, match=r"000000\.png: is not a readable"):
         watch(tmp_path / "s", patience=brief)
     shutil.rmtree(tmp_path / "s" / "depth")
     (tmp_path / "s" / "depth").mkdir()
     with pytest.raises(InputError, match="holds no depth image"):
         watch(tmp_path / "s", patience=brief)
+
+
+def test_what_cannot_be_read_in_the_end_is_left_out_and_said(
+    tmp_path: Path, frames: list[Frame], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The writer died in its last frame, and another one is damaged."""
+    write_bop(tmp_path / "s", frames)
+    sequence = watch(tmp_path / "s", patience=QUICK)
+    for name in ("000003.png", "000004.png"):
+        depth = tmp_path / "s" / "depth" / name
+        depth.write_bytes(depth.read_bytes()[:200])
+    assert [frame.index for frame in sequence] == [0, 1, 2]
+    for name in ("000003.png", "000004.png"):
+        assert name in caplog.text
+    assert caplog.text.count("continuing with the frames so far") == 2
+
+
+@pytest.mark.parametrize("lost", ["s", "s/scene_camera.json"])
+def test_what_goes_away_ends_the_sequence(
+    tmp_path: Path, frames: list[Frame], caplog: pytest.LogCaptureFixture, lost: str
+) -> None:
+    write_bop(tmp_path / "s", frames)
+    coming = iter(watch(tmp_path / "s", patience=QUICK))
+    assert next(coming).index == 0
+    (tmp_path / lost).rename(tmp_path / "away")
+    rest = [frame.index for frame in coming]
+    assert rest == [1, 2, 3, 4][: len(rest)]
+    assert "continuing with the frames so far" in caplog.text
+
+
+def test_frames_that_come_late_are_not_lost(tmp_path: Path, frames: list[Frame]) -> None:
+    write_bop(tmp_path / "s", frames)
+    late = tmp_path / "s" / "depth" / "000002.png"
+    late.rename(tmp_path / "late.png")
+    taken = []
+    for frame in watch(tmp_path / "s", patience=QUICK):
+        taken.append(frame.index)
+        if frame.index == 4:
+            (tmp_path / "late.png").rename(late)
+    assert taken == [0, 1, 3, 4, 2]
+
+
+def test_a_link_to_nothing_does_not_make_frames_count_as_settled(tmp_path: Path, frames: list[Frame]) -> None:
+    """As editors lock files."""
+    write_bop(tmp_path / "s", frames)
+    for folder in (tmp_path / "s", tmp_path / "s" / "rgb"):
+        (folder / ".#lock").symlink_to("nobody@nowhere.1")
+    before = _state(tmp_path / "s")
+    (tmp_path / "s" / "rgb" / "000004.png").touch()
+    assert _state(tmp_path / "s") != before
+    before = _state(tmp_path / "s")
+    (tmp_path / "s" / "scene_camera.json").touch()
+    assert _state(tmp_path / "s") != before

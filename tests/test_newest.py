@@ -69,6 +69,13 @@ def test_of_a_fast_source_the_newest_is_yielded_and_nothing_is_lost() -> None:
     assert kept  # what waits is moved out of memory
 
 
+def test_frames_that_come_late_are_filled_in_with_those_skipped() -> None:
+    frames = at([float(k) for k in range(4)])
+    newest = NewestFrames((frames[k] for k in (0, 2, 3, 1)), lambda frame: frame)
+    assert numbers(list(newest)) == [0, 2, 3]
+    assert numbers(newest.skipped) == [1]
+
+
 def test_frames_far_apart_in_time_are_never_skipped() -> None:
     read = threading.Event()
 

@@ -236,7 +236,7 @@ def _run(
         ):
             followed = frames.live and (console.watched or stream.shown is not None)
             wanted = frames.until(lambda: interrupt.asked)
-            coming = interrupt.until(while_it_lasts(wanted) if frames.live and not options.watch else wanted)
+            coming = interrupt.until(while_it_lasts(wanted) if frames.live else wanted)
             for event in _events(run, coming, interrupt, live=frames.live):
                 console(event)
                 if isinstance(event, Step):
@@ -266,8 +266,8 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt, *, live: bo
         newest = NewestFrames(frames)
         yield from run.track(newest, live=True)
         if newest.skipped:
-            say(f"adding {len(newest.skipped)} frames that were skipped to keep up; Ctrl-C leaves them out")
-        yield from run.fill(interrupt.until_next(newest.skipped))
+            say(f"adding {len(newest.skipped)} frames that were skipped or came late; Ctrl-C leaves them out")
+        yield from run.fill(interrupt.until_next(sorted(newest.skipped, key=lambda frame: frame.index)))
     else:
         yield from run.track(frames)
     yield from run.revisit()

@@ -23,13 +23,14 @@ class NewestFrames:
     """
 
     frames: Iterable[Frame]
-    """The source, in order of time. If it raises, the error follows its frames."""
+    """The source, in order of time but for frames that come late, which are skipped. If it raises, the error follows
+    its frames."""
     keep: Callable[[Frame], Frame] = field(default_factory=lambda: ViewStore().keep_frame)
     """Moves the images of a frame that has to wait out of memory; called by the reading thread."""
     max_gap_s: float = 0.25
     """Longest time between two frames with skipped ones in between: 15° of an object turned at 60° a second."""
     skipped: list[Frame] = field(default_factory=list)
-    """The skipped frames so far, in order of time."""
+    """The skipped frames so far, in order of time but for those that came late."""
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the first frame, and then the newest each time until the source ends.
@@ -44,11 +45,15 @@ class NewestFrames:
 
         def read() -> None:
             nonlocal ended
+            newest = -1
             try:
                 for frame in self.frames:
                     if stopped:
                         return
-                    kept = self.keep(frame) if waiting else frame
+                    if frame.index < newest:  # it came late
+                        self.skipped.append(self.keep(frame))
+                        continue
+                    newest, kept = frame.index, self.keep(frame) if waiting else frame
                     with state:
                         waiting.append(kept)
                         state.notify()
