@@ -85,7 +85,7 @@ def test_a_killed_run_is_taken_up(scene: Path, whole: Path, tmp_path: Path, aske
     ended = subprocess.run([sys.executable, "-c", KILLED_AT_THE_FIRST_PAIR, *command], check=False)
     assert ended.returncode == -signal.SIGKILL
     assert not json.loads((folder / "report.json").read_bytes())["complete"]
-    (known,) = (tuple(map(int, path.name.split("-")[:2])) for path in kept.glob("*.npz"))
+    (known,) = (tuple(map(int, path.name.split("-")[:2])) for path in kept.glob("*.pair"))
     assert main(command) == 2  # neither --resume nor --overwrite
     assert main([*command, "--resume", "--seed", "1"]) == 2
     assert asked == []
@@ -191,7 +191,7 @@ def test_what_is_said_to_be_saved_is_on_the_disk(
         assert any(what == "synced" and part.startswith(f".{name}.") for what, part in final[:place])
         assert ("synced", "run") in final[place:]
     assert ("synced", "recording.rrd") in final
-    kept = [name for what, name in done if what == "replaced" and name.endswith(".npz")]
+    kept = [name for what, name in done if what == "replaced" and name.endswith(".pair")]
     assert len(kept) == len(pairs_of(whole))
     assert {("synced", name) for name in kept} <= set(done)
 
@@ -277,6 +277,11 @@ def test_what_is_kept_and_broken_counts_as_lost(tmp_path: Path, rng: np.random.G
     content = file.read_bytes()
     for cut in (0, 10, len(content) // 2, len(content) - 3):
         file.write_bytes(content[:cut])
+        assert pairs.get(7, 3, "key") is None
+    for place in rng.integers(0, 8 * len(content), 200):
+        flipped = bytearray(content)
+        flipped[place // 8] ^= 1 << (place % 8)
+        file.write_bytes(flipped)
         assert pairs.get(7, 3, "key") is None
     np.savez(file, mean=np.array([{}], dtype=object), allow_pickle=True)  # nothing is unpickled
     assert pairs.get(7, 3, "key") is None

@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import io
 import shutil
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -30,6 +29,7 @@ from modeler.types import (
 )
 
 _DRAWN = 64  # poses at which priors are compared
+_CHECK_BYTES = 16
 _GAUSSIAN = ("mean", "covariance", "by_focal")  # its arrays
 _digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several keys
 
@@ -54,10 +54,13 @@ class Pairs:
             key: a digest of all inputs of the result.
         """
         try:
-            packed = io.BytesIO(read_regular(self._path(source, target, key)))
-            with np.load(packed, allow_pickle=False) as kept:
+            data = read_regular(self._path(source, target, key))
+            packed = data[_CHECK_BYTES:]
+            if data[:_CHECK_BYTES] != _check(packed):  # damaged: reading it could fail in any way, or return anything
+                return None
+            with np.load(io.BytesIO(packed), allow_pickle=False) as kept:
                 return _posterior({name: kept[name] for name in kept.files})
-        except (InputError, OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        except (InputError, ValueError, KeyError):  # of another version
             return None
 
     def keep(self, posterior: Posterior, key: str) -> None:
@@ -67,7 +70,8 @@ class Pairs:
         with contextlib.suppress(OSError, InputError):
             self.folder.mkdir(exist_ok=True)
             path = self._path(posterior.source, posterior.target, key)
-            write_atomically(path, packed.getvalue(), tidy=False)  # thousands; they go together
+            data = _check(packed.getvalue()) + packed.getvalue()
+            write_atomically(path, data, tidy=False)  # thousands; they go together
             settle_soon(path, self.folder)  # waiting for the disk would take as long as registering
 
     @property
@@ -111,7 +115,7 @@ class Pairs:
         return self.folder.with_name(f"{self.folder.name}.dropped")
 
     def _path(self, source: int, target: int, key: str) -> Path:
-        return self.folder / f"{source:06d}-{target:06d}-{key}.npz"
+        return self.folder / f"{source:06d}-{target:06d}-{key}.pair"
 
 
 @final
@@ -143,6 +147,11 @@ class PairCache(AbstractPairCache):
         found = registrar.register(source, target, density, rng=rng, effort=effort)
         self.pairs.keep(found, key)
         return found
+
+
+def _check(packed: bytes) -> bytes:
+    """Return what stands before the arrays in a file, to tell whether they are as they were written."""
+    return hashlib.blake2b(packed, digest_size=_CHECK_BYTES).digest()
 
 
 def _key(inputs: Sequence[object], views: Sequence[RayImage], density: AbstractPoseDensity) -> str:
