@@ -8,6 +8,7 @@ import os
 import resource
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -280,6 +281,40 @@ def test_a_recording_is_viewed_in_the_browser(run: list[Step], tmp_path: Path) -
     served.stop()
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(unquote(source), timeout=5.0)
+
+
+def answer(port: int, request: bytes, *, reset: bool = False) -> bytes:
+    """Return what a server on this machine answers to bytes; nothing where the connection is reset at once."""
+    with socket.create_connection(("127.0.0.1", port), timeout=5.0) as connection:
+        connection.sendall(request)
+        if reset:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            return b""
+        return b"".join(iter(lambda: connection.recv(1 << 16), b""))
+
+
+def test_a_recording_is_served_to_this_machine_alone_and_quietly(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    recording = tmp_path / "recording.rrd"
+    recording.write_bytes(bytes(50_000_000))
+    server = viewer._file_server(recording, "http://127.0.0.1:1")
+    port = server.server_port
+    for host, status in ((f"127.0.0.1:{port}", b"200"), (f"evil.example:{port}", b"421"), ("evil.example", b"421")):
+        got = answer(port, f"GET /recording.rrd HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        assert got.split()[1] == status
+        assert (len(got) > 50_000_000) == (status == b"200")
+    assert answer(port, b"GET / HTTP/1.0\r\n\r\n").split()[1] == b"421"
+    named = f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode()
+    answer(port, named, reset=True)
+    answer(port, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(200) + b"\r\n\r\n")
+    recording.unlink()
+    assert answer(port, named).split()[1] == b"404"
+    os.mkfifo(recording)
+    assert answer(port, named).split()[1] == b"404"
+    server.shutdown()
+    server.server_close()
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

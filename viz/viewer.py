@@ -13,9 +13,9 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +25,8 @@ from modeler.system.regular_files import check_regular, open_regular
 from modeler.types import InputError
 
 _HOST: Final = "127.0.0.1"
+_LOOPBACK: Final = (_HOST, "localhost")
+_REQUEST_S: Final = 30.0  # without a byte, until a connection is closed
 _START_S: Final = 20.0
 _STOP_S: Final = 3.0
 # Runs the viewer so that Linux kills it when the process that started it ends, however that ends (prctl, option
@@ -190,14 +192,25 @@ def _child_of_lasting_thread(command: list[str]) -> subprocess.Popen[bytes]:
 class _OneFile(BaseHTTPRequestHandler):
     """Answers every request with one file, for pages of one origin."""
 
+    timeout = _REQUEST_S
+
     def __init__(self, *request: Any, file: Path, origin: str) -> None:
         self._file, self._origin = file, origin
         super().__init__(*request)
 
     def do_GET(self) -> None:
         """Send the file."""
-        with suppress(ConnectionError), open_regular(self._file) as content:
-            self.send_response(200)
+        # Another name may be of a page elsewhere, which has it resolved to this machine to read what is here.
+        if self.headers.get("Host", "").rpartition(":")[0] not in _LOOPBACK:
+            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
+            return
+        try:
+            content = open_regular(self._file)
+        except (OSError, InputError):
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        with content:
+            self.send_response(HTTPStatus.OK)
             self.send_header("Access-Control-Allow-Origin", self._origin)
             self.send_header("Content-Type", "application/octet-stream")
             self.end_headers()
@@ -207,9 +220,16 @@ class _OneFile(BaseHTTPRequestHandler):
         """Say nothing: stderr is for the run."""
 
 
+class _FileServer(ThreadingHTTPServer):
+    """A server of which a connection that breaks is no error."""
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing."""
+
+
 def _file_server(file: Path, origin: str) -> ThreadingHTTPServer:
     """Serve one file on 127.0.0.1 to pages of an origin, from a thread that ends with this process."""
-    server = ThreadingHTTPServer((_HOST, 0), partial(_OneFile, file=file, origin=origin))
+    server = _FileServer((_HOST, 0), partial(_OneFile, file=file, origin=origin))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return server
 
