@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import pytest
 from PIL import Image
 
 from modeler.sequences import open_sequence, survey, write_bop
+from modeler.sequences.image_files import read_depth
 from modeler.types import Frame, InputError
 from studies.formats.clouds import WRITERS as CLOUDS
 from studies.formats.image_folders import raw_depth, save, write_bundlesdf, write_open3d, write_tum
@@ -198,6 +201,15 @@ def test_the_folder_of_the_images_alone_is_told_from_its_sequence(tmp_path: Path
         open_sequence(tmp_path / "scene" / "depth")
     with pytest.raises(InputError, match=r"000000\.png"):
         open_sequence(tmp_path / "scene" / "depth" / "000000.png")
+
+
+def test_pictures_read_by_two_threads_leave_stderr_as_it_was(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "a.tiff"
+    Image.fromarray(np.arange(90_000, dtype=np.uint16).reshape(300, 300)).save(picture, compression="tiff_lzw")
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(read_depth, [picture] * 200))
+    os.write(2, b"here")
+    assert capfd.readouterr().err == "here"
 
 
 def test_tiff_pictures_are_read(tmp_path: Path, frames: list[Frame]) -> None:
