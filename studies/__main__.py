@@ -11,6 +11,8 @@ import sys
 
 STUDIES: dict[str, tuple[str, str]] = {
     "ablation": ("what each stage and constant of the default registration contributes", "many hours"),
+    "ablation.constants": ("what halving and doubling each named number of other rooms changes", "hours"),
+    "ablation.evidence": ("marginal likelihoods of wrong registrations against those of a run's edges", "minutes"),
     "active": ("suggested actions: predicted against realised gains, actions until done", "an hour"),
     "active.picture": ("draw a robot that follows the suggestions", "a minute"),
     "active.pokes": ("spin between two views after pokes, predicted and realised", "minutes"),
@@ -33,6 +35,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "loops.covariances": ("covariances of whole runs against the truth", "hours"),
     "loops.focal_lengths": ("focal lengths estimated from loops", "minutes"),
     "loops.memory": ("memory and time of builds of thousands of frames", "minutes to hours"),
+    "numbers": ("named numbers of the package by room", "seconds"),
     "same_bytes": ("results of this tree and of another commit, byte by byte", "minutes"),
     "scale": ("throughput of batches", "15 minutes"),
     "scenes": ("segmentation of rendered scenes, models behind hands and grippers", "half an hour"),

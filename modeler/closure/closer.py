@@ -12,6 +12,7 @@ from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresho
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.closure.relocaliser import Placement, Relocaliser
+from modeler.priors.general import LARGE_DEG
 from modeler.types import (
     AWAY_DEG,
     NEAR_DEG,
@@ -40,7 +41,7 @@ class Closer:
 
     max_angle_deg: float = NEAR_DEG
     """Largest predicted rotation in degrees to an earlier view."""
-    max_return_deg: float = 75.0
+    max_return_deg: float = LARGE_DEG
     """The same between the last frame and the first if no loop is closed yet: the largest rotation across which views
     are registered (`priors.general.relaxed_limits`). A turn of few large steps ends one step before its start."""
     away_deg: float = AWAY_DEG

@@ -15,7 +15,7 @@ from modeler.closure.map_view import MapView, ShortestPaths
 from modeler.types import Array
 
 _MAX_EXACT = 6  # views whose gain is computed exactly: those with the largest bounds
-_RECENT_EDGES = 20  # newest edges, whose mean covariance is assumed for the next
+RECENT_EDGES = 20  # newest ones, whose mean covariance and median evidence are assumed for the next
 _OVERLAP_POINTS = 200  # of a view, to predict its overlap
 
 
@@ -111,7 +111,7 @@ class InformationGain:
         """Mean covariance (6, 6) of the newest edges; None if there are none."""
         solution = self.map_view.solution
         edges = (edge for edge in reversed(self.map_view.edges) if solution.takes_part(edge))
-        recent = [solution.pose_of(edge).covariance for edge in islice(edges, _RECENT_EDGES)]
+        recent = [solution.pose_of(edge).covariance for edge in islice(edges, RECENT_EDGES)]
         return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
 
     def _overlap(self, frame: int) -> float:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from modeler import se3
+from modeler.fusion.fuser import Fuser
 from modeler.types import ObjectModel, Solution
 
 _MAX_VIEWS = 60  # spread over a run: more are redundant
-_MIN_COSINE = 0.3  # between normal and the ray to a camera: more grazing surface does not contribute to the mesh
 
 
 def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
@@ -33,7 +33,7 @@ def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
         moved = drawn + np.cross(by_focal[:3], vertices_m) + by_focal[3:]
         rays = object_from_camera[:3, 3] - vertices_m
         cosines = np.sum(normals * rays, axis=1) / np.linalg.norm(rays, axis=1)
-        share = np.where(cosines > _MIN_COSINE, cosines, 0.0)
+        share = np.where(cosines >= Fuser.min_cosine, cosines, 0.0)  # what contributes to the mesh
         total += share * np.sum(normals * moved, axis=1)
         weight += share
     by_normal = np.divide(total, weight, out=np.zeros(len(total)), where=weight > 0.0)

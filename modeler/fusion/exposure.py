@@ -12,7 +12,7 @@ from modeler.kernels import tsdf
 from modeler.kernels.shading import HARMONICS, harmonics_of
 from modeler.types import Array, BoolArray
 
-DARK, BRIGHT = 12.0, 243.0  # levels (of 255) beyond which a pixel may be clipped: 5 % at either end
+CLIPPED = 12.0  # levels from 0 and from 255 within which a pixel may be clipped: 5 % at either end
 LOOKUPS = 100_000  # points times views at which colours are compared, which bounds time
 ROUNDS = 8  # of iteratively reweighted least squares
 GAIN_SIGMA = 0.05  # prior sd of log gains; chosen by hand
@@ -73,7 +73,7 @@ def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
             levels[row], weights[row] = colours[:, :3], colours[:, 3]
             basis[row] = harmonics_of(normals, one.poses[0])
             row += 1
-    weights[np.any((levels < DARK) | (levels > BRIGHT), axis=2)] = 0.0
+    weights[np.any(np.abs(levels - 127.5) > 127.5 - CLIPPED, axis=2)] = 0.0
     weights[:, np.count_nonzero(weights, axis=0) < 2] = 0.0
     common = weights.any(axis=1)
     if not common.any():

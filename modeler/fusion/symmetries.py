@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.fusion.alignment import even_rotations
+from modeler.fusion.alignment import Matcher, even_rotations
 from modeler.fusion.paint import Paint, SurfacePoints, cielab
 from modeler.types import Array, BoolArray, ObjectModel
 
@@ -99,7 +99,7 @@ class SymmetryFinder:
     """Distance of like colours in CIELAB."""
     points: int = 4000
     """Points that are compared."""
-    icp_points: int = 250
+    icp_points: int = Matcher.points
     """Points used by ICP."""
     directions: int = 24
     """Directions spread evenly over half a sphere."""

@@ -12,7 +12,7 @@ from modeler.priors.mixtures import directions
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
 
 _SMALL_DEG = 30.0  # turn up to which the limit of the centroids' offset is used as given
-_LARGE_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of its surface seen before
+LARGE_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of its surface seen before
 _MARGIN_DEG = 5.0  # of limits around confident proposals: they bound the search, and must not truncate the posterior
 
 
@@ -113,7 +113,7 @@ def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -
 
     The rotation is capped, as views farther apart share too little surface to be registered.
     """
-    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, _LARGE_DEG))
+    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, LARGE_DEG))
     return rotation_deg, relaxed_offset_m(max_offset_m, steps)
 
 
@@ -128,7 +128,7 @@ def turned_offset_m(max_offset_m: float, turn_rad: float) -> float:
     The centroid of the visible surface lies in front of the object's centre, so that a turn by θ separates two of them
     by a chord proportional to 2 sin(θ/2).
     """
-    turn_rad = np.clip(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi), *np.radians([_SMALL_DEG, _LARGE_DEG]))
+    turn_rad = np.clip(abs(np.remainder(turn_rad + np.pi, 2.0 * np.pi) - np.pi), *np.radians([_SMALL_DEG, LARGE_DEG]))
     chord = np.sin(turn_rad / 2.0) / np.sin(np.radians(_SMALL_DEG) / 2.0)
     return min(float(chord) * max_offset_m, MAX_LENGTH_M)
 

@@ -1,0 +1,107 @@
+"""What the stages of the study are given: frames, segmentations, poses and registered pairs, computed once.
+
+Nothing here depends on a number that is varied: changed packages are imported again (`source`), this module is not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import numpy as np
+
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractRegistrar,
+    Array,
+    BoolArray,
+    Frame,
+    Posterior,
+    RayImage,
+    Segmentation,
+)
+
+Figures = dict[str, float | str]
+"""What a stage measures, and a digest of all of it."""
+REGISTERED: dict[bytes, Posterior] = {}
+"""Posteriors of pairs, by views and prior."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """Frames of one capture or rendering."""
+
+    name: str
+    frames: Sequence[Frame]
+    true_masks: Sequence[BoolArray] | None = None
+    """(h, w) of each frame, where they are known."""
+    truth: Mapping[int, Array] | None = None
+    """camera_from_object (4, 4) by frame number, where it is known."""
+    is_focal_exact: bool = False
+    step_deg: float | None = None
+    """Of a turntable about an unknown axis; None: any motion."""
+    found: list[Segmentation] = field(default_factory=list)
+    """With the default numbers."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """Views with the poses of a run."""
+
+    name: str
+    views: Mapping[int, RayImage]
+    trajectory: Mapping[int, Array]
+    covariances: Mapping[int, Array]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class GivenMasks:
+    """A segmenter that returns what was found before."""
+
+    found: Mapping[int, Segmentation]
+
+    def segment(self, frame: Frame, scene: object) -> Segmentation:
+        """Return the segmentation of a frame by its number."""
+        del scene
+        return self.found[frame.index]
+
+
+@final
+@dataclass(frozen=True)
+class Recalling(AbstractRegistrar):
+    """A registrar that registers the same views with the same prior once."""
+
+    registers: AbstractRegistrar
+    """The method."""
+
+    @property
+    def least_effort(self) -> float:
+        """That of the method."""
+        return self.registers.least_effort
+
+    def register(
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        rng: np.random.Generator,
+        effort: float = 1.0,
+    ) -> Posterior:
+        """Return the posterior of target_from_source."""
+        state = rng.bit_generator.state
+        key = digest((self.registers, source.points_m, target.points_m, density, state, effort))
+        if key not in REGISTERED:
+            REGISTERED[key] = self.registers.register(source, target, density, rng=rng, effort=effort)
+        return REGISTERED[key]
+
+
+def digest(value: Any) -> bytes:
+    """Return a hash of a value's bytes."""
+    return hashlib.sha1(pickle.dumps(value), usedforsecurity=False).digest()
