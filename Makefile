@@ -2,6 +2,7 @@
 # make demo       model the bundled box sequence into runs/demo
 # make test       the whole gate: format, lint, types, layers, tests
 # make test-slow  the slow tests, which make test leaves out
+# make docs       the guide as a site: build/site/index.html (installs the extra docs; warnings are errors)
 # make calibrate  calibration of covariances, on rendered pairs and other cameras (many minutes)
 # make trust      reliability of status 0: 150 rendered runs, half with a fault (some 20 minutes a core)
 # make ablation   contribution of each stage and constant of the default registration (many hours)
@@ -14,7 +15,7 @@
 BIN := .venv/bin
 TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
 
-.PHONY: setup demo test test-slow calibrate trust ablation bench bench-gpu scale same audit
+.PHONY: setup demo test test-slow docs calibrate trust ablation bench bench-gpu scale same audit
 
 setup: .venv/.installed
 
@@ -40,6 +41,14 @@ test: setup
 
 test-slow: setup
 	$(BIN)/pytest -m slow $(TWO)
+
+docs: .venv/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "The guide is build/site/index.html"
+
+.venv/.docs: .venv/.installed
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	touch $@
 
 calibrate: setup
 	$(BIN)/python -m studies calibration

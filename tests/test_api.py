@@ -1,10 +1,9 @@
-"""What `import modeler` offers, and the Python of the README."""
+"""What `import modeler` offers."""
 
 from __future__ import annotations
 
 import os
 import pydoc
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,8 +16,6 @@ import modeler
 from modeler import se3
 from modeler.sequences import bundled
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
-PAIR, BUILD, LOOP = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 POSES = tabletop.turntable(15)
 SOURCE, TARGET = (tabletop.view(tabletop.Box((0.06, 0.045, 0.08)), POSES[index], index).frame for index in (1, 0))
 CAMERA = SOURCE.camera
@@ -85,36 +82,10 @@ def test_help_tells_frames_units_and_functions() -> None:
         assert words in text
 
 
-def test_a_pair_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
-    exec(PAIR, {})
-    assert capfd.readouterr().out.startswith("Outcome.CONVERGED")
-
-
-def test_the_sequence_of_the_readme_is_built(
-    capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    exec(_of_two_frames(BUILD), {})
-    assert capfd.readouterr().out.startswith("True 2 ")
-    assert (tmp_path / "runs" / "box-python" / "model.ply").exists()
-    assert (tmp_path / "runs" / "box-python" / "recording.rrd").exists()
-
-
 def test_a_model_is_never_built_into_its_sequence() -> None:
     for sequence in (bundled("box"), modeler.open_sequence(bundled("box")).select(every=2)):
         with pytest.raises(modeler.InputError, match="only read"):
             modeler.build(sequence, bundled("box") / "run")
-
-
-def test_the_loop_of_the_readme_runs(capfd: pytest.CaptureFixture[str]) -> None:
-    exec(_of_two_frames(LOOP), {})
-    assert capfd.readouterr().out == "0 True 1\n1 True 2\n1 True 2\n"
-
-
-def _of_two_frames(code: str) -> str:
-    quick = code.replace('open_sequence(bundled("box"))', 'open_sequence(bundled("box")).select(frames=slice(0, 2))')
-    assert quick != code
-    return quick
 
 
 def test_two_depth_images_give_a_pose_and_its_covariance() -> None:

@@ -1,4 +1,4 @@
-"""Help and README say what there is, and nothing else."""
+"""Help says what there is, and nothing else."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import io
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from command_runner import FILES, Run
+from command_runner import Run
 
 from modeler import priors
 from modeler.cli import main, parsed
@@ -109,18 +108,6 @@ def test_defaults_told_in_help_are_those_of_the_priors(build_help: str, name: st
     }
     numbers = {float(told[1])} if re.fullmatch(r"[0-9.]+", told[1]) and defaults else set()
     assert numbers == defaults
-
-
-README = (Path(__file__).parent.parent / "README.md").read_text()
-
-
-@pytest.mark.parametrize("line", re.findall(r"^    modeler ([^#\n]*)", README, re.MULTILINE))
-def test_commands_of_the_readme_are_understood(line: str) -> None:
-    assert parsed(line.split()).run.__doc__
-
-
-def test_the_readme_names_every_file_of_a_run_folder() -> None:
-    assert {name for name in re.findall(r"`(\w+\.\w+)`", README) if name in FILES} == FILES
 
 
 def test_the_version_is_told(cli: Run) -> None:

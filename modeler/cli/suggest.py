@@ -30,7 +30,7 @@ class Suggest:
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Run folder of `modeler build`."""
     candidates: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("turns, pokes, laying it down")] = None
-    """Possible actions with costs: JSON or TOML, or CSV of poses (docs/reference.md, "What to do next")."""
+    """Possible actions with costs: JSON or TOML, or CSV of poses (docs/next.md)."""
     until_sigma_mm: Annotated[float | None, tyro.conf.arg(metavar="MM"), default("none")] = None
     """Goal: largest standard deviation of the surface of a view, from noise and pose."""
     until_seen: Annotated[float | None, tyro.conf.arg(metavar="SHARE"), default("none")] = None
