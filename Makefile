@@ -44,7 +44,7 @@ test-slow: setup
 
 docs: .venv/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
-	@echo "The guide is build/site/index.html"
+	@echo "The guide is build/site/index.html; its search works where it is served: $(BIN)/mkdocs serve"
 
 .venv/.docs: .venv/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"

@@ -35,7 +35,7 @@ NOT_HERE = {
 }
 """What commands ask for that a test has not: they are only understood."""
 QUICK = ("README", "build")
-BUNDLED = ("sequences/bundled/box", "sequences/bundled/tube")
+SEQUENCES = "sequences/bundled/box sequences/bundled/tube turned poked carried shelf/cup shelf/tin".split()
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
@@ -81,15 +81,7 @@ def _matching(word: str) -> list[str]:
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Desk:
     folder = tmp_path_factory.mktemp("desk")
     frames, truth = small_frames(3), small_truth(3)
-    for name in (
-        "sequences/bundled/box",
-        "sequences/bundled/tube",
-        "turned",
-        "poked",
-        "carried",
-        "shelf/cup",
-        "shelf/tin",
-    ):
+    for name in SEQUENCES:
         write_bop(folder / name, frames, truth, {"motion": {"kind": "table"}}, depth_scale_mm=1.0)
         shutil.copy(bundled("box") / "model.ply", folder / name)
     hand = [(index, *pose[:3, 3], *_quaternion(pose)) for index, pose in truth.items()]  # carries the object's frame
@@ -147,6 +139,7 @@ def tried(desk: Desk, name: str) -> dict[str, Any]:
 OTHERS = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in PAGES if name != "python"]
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", OTHERS)
 def test_what_a_page_says_works(at_desk: Desk, name: str) -> None:
     tried(at_desk, name)

@@ -47,8 +47,9 @@ def test_an_installed_package_builds_a_bundled_sequence_from_another_folder(tmp_
     source, home, elsewhere = tmp_path / "source", tmp_path / "environment", tmp_path / "elsewhere"
     for name in ("modeler", "sequences", "viz"):
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
+    (source / "docs").mkdir()
+    for name in ("pyproject.toml", "LICENSE", "docs/package.md"):
+        shutil.copy(ROOT / name, source / name)
     elsewhere.mkdir()
     venv.create(home)
     python = home / "bin" / "python"
