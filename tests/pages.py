@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from sources import ROOT
+from source_trees import ROOT
 
 DOCS: Final = ROOT / "docs"
 GUIDE: Final = (

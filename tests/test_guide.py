@@ -16,15 +16,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commanded import FILES
+from command_runner import FILES
 from pages import DOCS, PAGES, Command, File, commands, steps
-from recordings import small_frames, small_truth
-from sources import ROOT
+from source_trees import ROOT
 
 from modeler import sequences
 from modeler.cli import main, parsed
 from modeler.sequences import bundled, write_bop
 from modeler.types import Frame, Outcome
+from studies.__main__ import STUDIES
+from studies.formats.image_folders import small_frames, small_truth
 
 NOT_HERE = {
     r"--view\b|modeler view": "opens a window",
@@ -52,6 +53,14 @@ def test_every_command_is_understood(line: str) -> None:
         assert words[5][2:-1] in EXTRAS
     else:
         assert line == ". .venv/bin/activate"
+
+
+def test_every_study_that_a_page_names_exists() -> None:
+    named = {
+        name for page in DOCS.rglob("*.md") for name in re.findall(r"python -m studies ([\w.]+)", page.read_text())
+    }
+    assert named
+    assert named <= set(STUDIES)
 
 
 class Desk:
