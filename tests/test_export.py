@@ -31,8 +31,8 @@ from modeler.export import (
 )
 from modeler.export.formats import cloud_ply, mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
+from modeler.export.placing import upright
 from modeler.export.reading import fault
-from modeler.export.standing import upright
 from modeler.types import (
     Array,
     InputError,

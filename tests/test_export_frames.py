@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.export import AS_GIVEN, default_up, placement, pose_file, write_mesh
-from modeler.export.placing import Origin, Up
-from modeler.export.standing import level_axes
+from modeler.export.placing import Origin, Up, level_axes
 from modeler.types import Array, ObjectModel
 
 

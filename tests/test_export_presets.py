@@ -12,7 +12,7 @@ from command_runner import Run
 from run_builders import ball
 
 from modeler import se3
-from modeler.export import physics, solids
+from modeler.export import solids
 from modeler.export.checks import Checks, mesh_checks
 from modeler.sequences import open_sequence
 from modeler.types import Array, InputError, ObjectModel
@@ -103,18 +103,18 @@ def test_a_print_stands_flat_and_stays_closed(laid_m: float | None) -> None:
     assert mesh.volume == pytest.approx(fine.volume, rel=0.01)
 
 
-def written(folder: Path) -> tuple[physics.PhysicsFiles, solids.Body]:
+def written(folder: Path) -> tuple[solids.PhysicsFiles, solids.Body]:
     """A box that leans, 2 kg, written for simulators; its inertia has products of every sign."""
     pose = se3.exp(np.array([0.3, -0.2, 0.5, 0.02, 0.01, 0.1]))
     body = solids.body_of(brick(pose), density_kg_m3=1.0, mass_kg=2.0)
     of, parts = (
-        physics.PhysicsFiles(folder / "a box", coloured=False),
+        solids.PhysicsFiles(folder / "a box", coloured=False),
         solids.ConvexParts(((brick(pose).vertices_m, brick().triangles),), "itself"),
     )
-    physics.write_parts(of, parts)
+    solids.write_parts(of, parts)
     of.visual.write_bytes(of.part(0).read_bytes())
-    physics.write_mjcf(of, body, parts)
-    physics.write_urdf(of, body, parts)
+    solids.write_mjcf(of, body, parts)
+    solids.write_urdf(of, body, parts)
     return of, body
 
 
@@ -147,7 +147,7 @@ def test_mujoco_takes_the_body_as_it_is(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_path(str(of.scene))
     assert model.body_mass[1] == pytest.approx(2.0)
     np.testing.assert_allclose(np.sort(model.body_inertia[1]), np.linalg.eigvalsh(body.inertia_kg_m2), rtol=1e-6)
-    assert physics.settled_in_mujoco(of.scene).at_rest
+    assert solids.settled_in_mujoco(of.scene).at_rest
 
 
 def test_pybullet_takes_the_body_as_it_is(tmp_path: Path) -> None:
@@ -158,8 +158,8 @@ def test_pybullet_takes_the_body_as_it_is(tmp_path: Path) -> None:
     dynamics = pybullet.getDynamicsInfo(number, -1)
     pybullet.disconnect(client)
     assert dynamics[0] == pytest.approx(2.0)
-    assert dynamics[1] == pytest.approx(physics.FRICTION[0])
-    assert physics.settled_in_pybullet(of.urdf, 0.2).at_rest
+    assert dynamics[1] == pytest.approx(solids.FRICTION[0])
+    assert solids.settled_in_pybullet(of.urdf, 0.2).at_rest
 
 
 def test_checks_tell_what_does_not_hold(tmp_path: Path) -> None:

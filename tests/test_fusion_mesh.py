@@ -10,7 +10,7 @@ import trimesh
 from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 
 from modeler import se3
-from modeler.export.texture import PIECE, textured
+from modeler.export.mesh import PIECE, textured
 from modeler.fusion import Fuser, FusionVolume, meshing, watertight
 from modeler.types import Array, ObjectModel, Plane
 

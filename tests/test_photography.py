@@ -13,8 +13,19 @@ from scipy.ndimage import map_coordinates
 from trimesh.visual.texture import TextureVisuals
 
 from modeler import se3
-from modeler.sequences.rendering.charts import Chart, Cylindrical, Faces, Spherical, Unwrapped
-from modeler.sequences.rendering.labels import Embedded, Label, Picture, Print, gamma_coded, linear_light
+from modeler.sequences.rendering.labels import (
+    Chart,
+    Cylindrical,
+    Embedded,
+    Faces,
+    Label,
+    Picture,
+    Print,
+    Spherical,
+    Unwrapped,
+    gamma_coded,
+    linear_light,
+)
 from modeler.sequences.rendering.photography import Lamp, Photography, SmoothNormals
 from modeler.sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import rerun.blueprint as rrb
 
-from modeler.export.standing import upright
+from modeler.export.placing import upright
 from modeler.types import Array, RayImage
 from modeler.viz import entities, graph_view, images
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
-from modeler.export.standing import upright
+from modeler.export.placing import upright
 from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Array, Camera, Edge, PoseGaussian, Step
 from modeler.viz import entities

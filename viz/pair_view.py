@@ -12,7 +12,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
-from modeler.export.standing import upright
+from modeler.export.placing import upright
 from modeler.types import Array, Mode, Posterior, RayImage, Step
 from modeler.viz import entities
 from modeler.viz.drawings import (

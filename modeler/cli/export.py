@@ -16,7 +16,7 @@ Up = Literal["z", "y"]
 Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
 
 if TYPE_CHECKING:
-    from modeler.export.texture import Texture
+    from modeler.export.mesh import Texture
     from modeler.fusion import FusionVolume
     from modeler.types import ObjectModel
 
@@ -76,7 +76,7 @@ class Export:
             return self._for(self.purpose)
         from modeler import export as files
         from modeler.cli.outputs import check_files, run_inputs
-        from modeler.export.texture import TRIANGLES
+        from modeler.export.mesh import TRIANGLES
         from modeler.types import InputError
 
         _check(self)

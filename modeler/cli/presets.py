@@ -21,10 +21,10 @@ from modeler.cli.convert import finest_unit_mm
 from modeler.cli.export import Export, Purpose
 from modeler.cli.inputs import Reopened, reopened
 from modeler.cli.outputs import check_files, check_folder, run_inputs
-from modeler.export import bop, physics, solids
+from modeler.export import bop, solids
 from modeler.export.checks import Checks, loaded, mesh_checks
-from modeler.export.standing import model_up
-from modeler.export.texture import TRIANGLES, Texture
+from modeler.export.mesh import TRIANGLES, Texture
+from modeler.export.placing import model_up
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
 from modeler.sequences import write_bop
 from modeler.types import Array, InputError, ObjectModel
@@ -97,7 +97,7 @@ class Preset:
         if self.purpose in _FILES:
             meshes = files.files_of(out, textured=textured and self.purpose == "foundationpose")
             return (*meshes, files.pose_file(out))
-        of = physics.PhysicsFiles(out, textured)
+        of = solids.PhysicsFiles(out, textured)
         model = (of.mjcf, of.scene) if self.purpose == "mujoco" else (of.urdf,)
         return (*model, *files.files_of(of.visual, textured=textured), files.pose_file(of.visual), of.part(0))
 
@@ -137,7 +137,7 @@ class Preset:
         files.write_mesh(place.placed(model), out, texture, axes=place.axes)
         place.write(out)
         self._report(place)
-        checks = mesh_checks(out, most_triangles=physics.MOST_TRIANGLES)
+        checks = mesh_checks(out, most_triangles=solids.MOST_TRIANGLES)
         if texture is None:
             return checks.also(True, "no texture, as the frames have no colour")
         mesh = loaded(out)
@@ -180,26 +180,26 @@ class Preset:
 
     def _mujoco(self) -> Checks:
         of, body, parts = self._body()
-        physics.write_mjcf(of, body, parts)
+        solids.write_mjcf(of, body, parts)
 
         def settles() -> tuple[bool, str]:
-            settled = physics.settled_in_mujoco(of.scene)
+            settled = solids.settled_in_mujoco(of.scene)
             return settled.at_rest, settled.words
 
         return self._solid_checks(of, body, parts).attempt(settles, "MuJoCo is not installed, so not loaded there")
 
     def _urdf(self) -> Checks:
         of, body, parts = self._body()
-        physics.write_urdf(of, body, parts)
+        solids.write_urdf(of, body, parts)
 
         def settles() -> tuple[bool, str]:
             with _quiet():  # PyBullet writes to stdout by itself
-                settled = physics.settled_in_pybullet(of.urdf, physics.drop_height_m(parts))
+                settled = solids.settled_in_pybullet(of.urdf, solids.drop_height_m(parts))
             return settled.at_rest, settled.words
 
         return self._solid_checks(of, body, parts).attempt(settles, "PyBullet is not installed, so not loaded there")
 
-    def _body(self) -> tuple[physics.PhysicsFiles, solids.Body, solids.ConvexParts]:
+    def _body(self) -> tuple[solids.PhysicsFiles, solids.Body, solids.ConvexParts]:
         """Write the visual mesh and the convex parts, and return them with mass and inertia."""
         whole = self._model(watertight=True)
         place = files.placement(whole, self._reopened.report, "base", "z")
@@ -207,18 +207,18 @@ class Preset:
         body = solids.body_of(place.placed(whole), density_kg_m3=density, mass_kg=self.options.mass_kg)
         parts = solids.convex_parts(place.placed(whole))
         model, texture = self._coloured(whole)
-        of = physics.PhysicsFiles(self.options.out, texture is not None)
+        of = solids.PhysicsFiles(self.options.out, texture is not None)
         files.write_mesh(place.placed(model), of.visual, texture, axes=place.axes)
         place.write(of.visual)
-        physics.write_parts(of, parts)
+        solids.write_parts(of, parts)
         self._report(place)
         source = "as given" if self.options.mass_kg is not None else f"at {density:g} kg/m³"
-        say(f"{body.mass_kg:.3g} kg {source}; friction {physics.FRICTION[0]:g}, a default: neither is measured")
+        say(f"{body.mass_kg:.3g} kg {source}; friction {solids.FRICTION[0]:g}, a default: neither is measured")
         return of, body, parts
 
-    def _solid_checks(self, of: physics.PhysicsFiles, body: solids.Body, parts: solids.ConvexParts) -> Checks:
+    def _solid_checks(self, of: solids.PhysicsFiles, body: solids.Body, parts: solids.ConvexParts) -> Checks:
         return (
-            mesh_checks(of.visual, most_triangles=physics.MOST_TRIANGLES)
+            mesh_checks(of.visual, most_triangles=solids.MOST_TRIANGLES)
             .also(True, f"closed around {1e6 * body.volume_m3:.1f} cm³")
             .also(solids.is_possible_inertia(body.inertia_kg_m2), "physically possible inertia")
             .also(

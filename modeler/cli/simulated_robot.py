@@ -8,7 +8,7 @@ from typing import Final, final
 import numpy as np
 
 from modeler.sequences.rendering.recipe import Recipe
-from modeler.sequences.rendering.stage import Stage
+from modeler.sequences.rendering.renderer import Stage
 from modeler.suggestion import Belief, Candidate
 
 TURN_SIGMA_DEG: Final = 2.0

@@ -2,13 +2,13 @@
 
 from modeler.experiment.experiment import Experiment as Experiment
 from modeler.experiment.experiment import Pairing as Pairing
+from modeler.experiment.experiment import Summary as Summary
+from modeler.experiment.experiment import Trial as Trial
 from modeler.experiment.experiment import sparse_view as sparse_view
+from modeler.experiment.experiment import summaries as summaries
 from modeler.experiment.models import Modelled as Modelled
 from modeler.experiment.models import ModelScore as ModelScore
 from modeler.experiment.models import model_scores as model_scores
 from modeler.experiment.models import models_csv as models_csv
 from modeler.experiment.models import models_json as models_json
 from modeler.experiment.results import evaluate as evaluate
-from modeler.experiment.trials import Summary as Summary
-from modeler.experiment.trials import Trial as Trial
-from modeler.experiment.trials import summaries as summaries

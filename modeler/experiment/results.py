@@ -10,8 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from modeler.experiment.experiment import Experiment, Recorded
-from modeler.experiment.trials import Quantiles, Summary, Trial, summaries
+from modeler.experiment.experiment import Experiment, Quantiles, Recorded, Summary, Trial, summaries
 from modeler.export import write_atomically
 from modeler.types import InputError
 

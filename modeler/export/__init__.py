@@ -11,12 +11,14 @@ from modeler.export.mesh import files_of as files_of
 from modeler.export.mesh import format_of as format_of
 from modeler.export.mesh import mesh_of as mesh_of
 from modeler.export.mesh import simplified as simplified
+from modeler.export.mesh import textured as textured
 from modeler.export.mesh import tinted as tinted
 from modeler.export.mesh import write_mesh as write_mesh
 from modeler.export.pairs import PairCache as PairCache
 from modeler.export.pairs import Pairs as Pairs
 from modeler.export.placing import Placement as Placement
 from modeler.export.placing import default_up as default_up
+from modeler.export.placing import model_upright as model_upright
 from modeler.export.placing import placement as placement
 from modeler.export.placing import pose_file as pose_file
 from modeler.export.reading import edges_of as edges_of
@@ -26,5 +28,3 @@ from modeler.export.report import RunMeta as RunMeta
 from modeler.export.report import edge_record as edge_record
 from modeler.export.report import report_of as report_of
 from modeler.export.run_folder import RunFolder as RunFolder
-from modeler.export.standing import model_upright as model_upright
-from modeler.export.texture import textured as textured

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.export.files import write_atomically
-from modeler.export.standing import model_upright
+from modeler.export.placing import model_upright
 from modeler.system.regular_files import read_regular
 from modeler.types import ACCEPTED, Array, InputError, ObjectModel
 

@@ -9,7 +9,7 @@ from scipy.ndimage import laplace, minimum_filter
 
 from modeler.fusion.depth_views import DepthViews, ViewBlocks
 from modeler.kernels import tsdf
-from modeler.kernels.shading import HARMONICS, harmonics_of
+from modeler.kernels.photometric import HARMONICS, harmonics_of
 from modeler.types import Array, BoolArray
 
 CLIPPED = 12.0  # levels from 0 and from 255 within which a pixel may be clipped: 5 % at either end

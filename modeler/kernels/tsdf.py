@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from modeler.kernels.cache import njit
-from modeler.kernels.shading import HARMONICS, harmonics
+from modeler.kernels.photometric import HARMONICS, harmonics
 from modeler.kernels.threads import over_rows
 
 SIDE = 4  # voxels along the side of a block

@@ -9,7 +9,6 @@ from modeler.types.base import BoolArray as BoolArray
 from modeler.types.base import Float32Array as Float32Array
 from modeler.types.base import InputError as InputError
 from modeler.types.base import Outcome as Outcome
-from modeler.types.hands import HandPoses as HandPoses
 from modeler.types.interfaces import AbstractPairCache as AbstractPairCache
 from modeler.types.interfaces import AbstractPoseDensity as AbstractPoseDensity
 from modeler.types.interfaces import AbstractPrior as AbstractPrior
@@ -69,6 +68,7 @@ from modeler.types.views import COLOUR_SHIFT_PX as COLOUR_SHIFT_PX
 from modeler.types.views import NOMINAL_FOCAL as NOMINAL_FOCAL
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame
+from modeler.types.views import HandPoses as HandPoses
 from modeler.types.views import Plane as Plane
 from modeler.types.views import RayImage as RayImage
 from modeler.types.views import Segmentation as Segmentation

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 
 from modeler import se3
-from modeler.sequences.rendering.charts import Surfels
-from modeler.sequences.rendering.labels import LabelledMesh, gamma_coded, linear_light
+from modeler.sequences.rendering.labels import LabelledMesh, Surfels, gamma_coded, linear_light
 from modeler.sequences.rendering.meshes import Hits, IntArray, Mesh
 from modeler.types import Array, BoolArray
 

@@ -17,7 +17,7 @@ from modeler.pipeline import Modeler
 from modeler.pipeline.modeler import Run
 from modeler.priors import TablePrior
 from modeler.sequences.rendering.recipe import Recipe
-from modeler.sequences.rendering.stage import Stage
+from modeler.sequences.rendering.renderer import Stage
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.pose_gain import edge_information
 from modeler.types import Array, Step

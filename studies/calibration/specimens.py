@@ -9,8 +9,7 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from modeler.sequences.rendering.charts import Faces
-from modeler.sequences.rendering.labels import Label, Print
+from modeler.sequences.rendering.labels import Faces, Label, Print
 from modeler.sequences.rendering.photography import Lamp, Photography
 from modeler.sequences.rendering.recipe import Recipe, builtin_recipes, load_recipe
 

@@ -12,9 +12,8 @@ import numpy as np
 from modeler.cli import compose
 from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.sequences.rendering.recipe import Recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering.renderer import RenderedSequence, matrix_of, place_of
 from modeler.sequences.rendering.shapes import Box, Compound, Part, placement
-from modeler.sequences.rendering.stage import matrix_of, place_of
 from modeler.sequences.rendering.trajectory import Place, Places, Tabletop
 from modeler.types import BoolArray, Step
 from studies.calibration.specimens import load_specimen

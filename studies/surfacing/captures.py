@@ -25,7 +25,7 @@ from modeler.cli.inputs import Reopened, reopened
 from modeler.export import write_atomically
 from modeler.fusion import Fuser, FusionVolume, meshing
 from modeler.fusion.depth_views import free_of
-from modeler.kernels.shading import harmonics_of
+from modeler.kernels.photometric import harmonics_of
 from modeler.types import Array, BoolArray, RayImage
 from studies.surfacing.drawing import Scene
 from studies.surfacing.methods import Surface, open3d_poisson, open3d_tsdf

@@ -22,7 +22,7 @@ import trimesh
 from scipy import ndimage
 
 import modeler
-from modeler.export.standing import upright
+from modeler.export.placing import upright
 from modeler.fusion import Symmetries, SymmetryFinder
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.renderer import RenderedSequence

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from modeler import evaluation, se3
 from modeler.export import read_model, write_atomically
 from modeler.export.mesh import MOST_SIGMA_M
-from modeler.export.standing import model_up, model_upright
+from modeler.export.placing import model_up, model_upright
 from modeler.fusion import Symmetries, SymmetryFinder
 from modeler.types import ACCEPTED, Array, InputError, Outcome, loops_closed
 from modeler.viz.report import plots

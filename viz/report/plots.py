@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from modeler import evaluation, se3
-from modeler.export.standing import ring_axes
+from modeler.export.placing import ring_axes
 from modeler.types import Array, PoseGaussian
 from modeler.viz.figures import Curve, Panel, coverage_curves
 from modeler.viz.readings import Sd, sd_of

@@ -16,8 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from modeler.kernels import bands, photometric, scores
-from modeler.kernels.photometric import Colours
-from modeler.kernels.shading import harmonics_of, shading_of
+from modeler.kernels.photometric import Colours, harmonics_of, shading_of
 from modeler.types import Array, Frame, RayImage
 
 FINEST_PX = 0.6
