@@ -1,4 +1,9 @@
-"""Errors of poses and surfaces against ground truth."""
+"""Errors of motions, trajectories and surfaces against ground truth, and calibration of covariances.
+
+Truth is `camera_from_model(k)`: the pose (4, 4) of the object's model in the camera at frame k. Motions are compared in
+the source camera, translations at the object's centroid: displacements of the object due to a rotation error about the
+camera are included.
+"""
 
 from __future__ import annotations
 

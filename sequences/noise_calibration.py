@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from scipy.signal import savgol_coeffs
 
 from modeler.sequences.base import AbstractSequence
-from modeler.sequences.noise_model import NoiseModel, slope_terms
+from modeler.sequences.calibrated import NoiseModel, slope_terms
 from modeler.types import Array, BoolArray, Camera, InputError
 
 REACH = 4

@@ -29,7 +29,7 @@ from modeler.types import (
     loop_opening,
     loops_closed,
 )
-from modeler.types.chains import Chains
+from modeler.types.solution import Chains
 from modeler.viz.report.run_data import Result
 
 COUNT = 8

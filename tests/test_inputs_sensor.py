@@ -11,8 +11,8 @@ import pytest
 
 from modeler.cli import main
 from modeler.sequences import CalibratedSequence, NoiseModel, bundled, open_sequence, read_noise, write_bop
+from modeler.sequences.calibrated import noise_text, object_distance_m
 from modeler.sequences.noise_calibration import Calibration, borders, calibrate, pooled_px
-from modeler.sequences.noise_model import noise_text, object_distance_m
 from modeler.sequences.rendering.depth_sensor import gaussian_field
 from modeler.sequences.rendering.recipe import load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence

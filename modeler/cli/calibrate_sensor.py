@@ -42,8 +42,8 @@ class CalibrateSensor:
         from modeler.cli.outputs import check_files
         from modeler.export import write_atomically
         from modeler.sequences import open_sequence
+        from modeler.sequences.calibrated import noise_text, object_distance_m
         from modeler.sequences.noise_calibration import calibrate
-        from modeler.sequences.noise_model import noise_text, object_distance_m
 
         check_files([self.out], [self.input], overwrite=self.overwrite)
         sequence = open_sequence(self.input, self.given.overrides())

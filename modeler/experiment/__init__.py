@@ -6,9 +6,9 @@ from modeler.experiment.experiment import Summary as Summary
 from modeler.experiment.experiment import Trial as Trial
 from modeler.experiment.experiment import sparse_view as sparse_view
 from modeler.experiment.experiment import summaries as summaries
-from modeler.experiment.models import Modelled as Modelled
-from modeler.experiment.models import ModelScore as ModelScore
-from modeler.experiment.models import model_scores as model_scores
-from modeler.experiment.models import models_csv as models_csv
-from modeler.experiment.models import models_json as models_json
+from modeler.experiment.results import Modelled as Modelled
+from modeler.experiment.results import ModelScore as ModelScore
 from modeler.experiment.results import evaluate as evaluate
+from modeler.experiment.results import model_scores as model_scores
+from modeler.experiment.results import models_csv as models_csv
+from modeler.experiment.results import models_json as models_json

@@ -1,4 +1,4 @@
-"""Colours of surface seen by both views: their correlation, and their linear equations for a pose."""
+"""Colours of surface seen by both views: correlation, linear equations for a pose, and the shading by lamps."""
 
 import math
 from typing import NamedTuple
