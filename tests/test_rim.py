@@ -15,8 +15,7 @@ from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER_RIM, WEIGHT
 from modeler.priors import GeneralPrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.likelihood import PairLikelihood
-from modeler.registration.visibility.noise import nonnegative_solution, significant_variances
-from modeler.registration.visibility.points import OWN_RIM
+from modeler.registration.visibility.points import OWN_RIM, nonnegative_solution, significant_variances
 from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
 from modeler.sequences import bundled, open_sequence

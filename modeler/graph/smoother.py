@@ -10,11 +10,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler.graph.axis import AxisSolution, CommonAxis
-from modeler.graph.covariance import PoseCovariances, RelativeCovariance
+from modeler.graph.covariance import PoseCovariances, RelativeCovariance, SharedCovariance
 from modeler.graph.modes import select_modes
 from modeler.graph.optimise import IncrementalSolver, inliers, selected, solve_loops, values_of
 from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes, extended
-from modeler.graph.shared import SharedCovariance
 from modeler.types import Array, Edge, FocalLength, Solution
 
 _MAX_ROUNDS = 5  # of alternating between the axis and the inliers among the loops

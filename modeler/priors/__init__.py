@@ -1,11 +1,11 @@
 """Nonvisual information about the motion between two views: models of evidence, and proposals that guide the search."""
 
-from modeler.priors.auto import AutoPrior as AutoPrior
 from modeler.priors.general import AnyMotion as AnyMotion
 from modeler.priors.general import GeneralPrior as GeneralPrior
 from modeler.priors.held import HeldPrior as HeldPrior
 from modeler.priors.poke import Poke as Poke
 from modeler.priors.poke import PokePrior as PokePrior
+from modeler.priors.product import AutoPrior as AutoPrior
 from modeler.priors.product import ProductPrior as ProductPrior
 from modeler.priors.proposals import FeaturesPrior as FeaturesPrior
 from modeler.priors.proposals import PredictedProposal as PredictedProposal

@@ -15,11 +15,16 @@ from modeler.kernels import gauss_newton, point_likelihood, point_to_plane, scor
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
-from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.focal_length import rows_under
-from modeler.registration.visibility.noise import significant_variances
 from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
-from modeler.registration.visibility.points import OWN_RIM, IntArray, points_of, spread_points
+from modeler.registration.visibility.points import (
+    OWN_RIM,
+    FixedPattern,
+    IntArray,
+    points_of,
+    significant_variances,
+    spread_points,
+)
 from modeler.se3 import matrices, rows
 from modeler.types import Array, RayImage
 

@@ -16,11 +16,10 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import point_to_plane
 from modeler.registration.posterior import FLOOR
-from modeler.registration.visibility.fixed_pattern import FixedPattern
 from modeler.registration.visibility.focal_length import KNOWN, FocalNuisance
 from modeler.registration.visibility.likelihood import DirectedLikelihood, MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
-from modeler.registration.visibility.points import OWN_RIM, IntArray
+from modeler.registration.visibility.points import OWN_RIM, FixedPattern, IntArray
 from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
 from modeler.types import Array, Camera
