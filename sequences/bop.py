@@ -31,8 +31,8 @@ from modeler.sequences.image_files import (
 )
 from modeler.sequences.input_files import Node, entries, first_folder, frame_number, is_there, read_tree
 from modeler.sequences.intrinsics import RANGE, Intrinsics, Overrides, of_matrix
+from modeler.sequences.meshes import Mesh, read_mesh
 from modeler.sequences.recording import AbstractRecording
-from modeler.sequences.rendering.meshes import Mesh, read_mesh
 from modeler.system.regular_files import left_behind
 from modeler.types import Array, BoolArray, Camera, Frame, InputError
 

@@ -14,6 +14,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "ablation.constants": ("what halving and doubling each named number of other rooms changes", "hours"),
     "ablation.evidence": ("marginal likelihoods of wrong registrations against those of a run's edges", "minutes"),
     "active": ("suggested actions: predicted against realised gains, actions until done", "an hour"),
+    "active.demo": ("a simulated robot that follows the suggestions", "minutes"),
     "active.picture": ("draw a robot that follows the suggestions", "a minute"),
     "active.pokes": ("spin between two views after pokes, predicted and realised", "minutes"),
     "bench": ("speed against Open3D and the committed baseline", "minutes"),

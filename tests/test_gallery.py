@@ -18,7 +18,7 @@ from PIL import Image
 from modeler.cli.jobs import NOTES
 from modeler.cli.models import THUMBNAIL_PX
 from modeler.export.models_table import enclosed_m3, read_table
-from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.shapes import Box
 
 COUNT = 1000

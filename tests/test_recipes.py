@@ -11,7 +11,8 @@ from input_errors import refused
 from slow_cases import sampled
 
 from modeler import se3
-from modeler.sequences.rendering.meshes import Mesh, outer_surface, ply_bytes
+from modeler.sequences.meshes import Mesh
+from modeler.sequences.rendering.meshes import outer_surface, ply_bytes
 from modeler.sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import (

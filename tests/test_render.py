@@ -10,6 +10,7 @@ import pytest
 
 from modeler import se3
 from modeler.sequences import bundled, open_sequence
+from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.depth_sensor import (
     EXACT,
     DepthSensor,
@@ -21,7 +22,6 @@ from modeler.sequences.rendering.depth_sensor import (
     RandomLoss,
     gaussian_field,
 )
-from modeler.sequences.rendering.meshes import Mesh
 from modeler.sequences.rendering.recipe import Mosaic, Recipe, Table, Viewpoint, Wall, load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence, render
 from modeler.sequences.rendering.shapes import AnyShape, Box, Compound, Part, Sphere

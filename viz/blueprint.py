@@ -25,15 +25,9 @@ def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb
         further: tabs after the first.
     """
     tabs = rrb.Tabs(_poses(first), *further, _object(first), _pair(first), _edges(first), _words(), active_tab=0)
-    return followed(tabs, fps=3.0)
-
-
-def followed(views: rrb.Container, *, fps: float) -> rrb.Blueprint:
-    """Return a layout of views only, which follow the newest frame and play at the given frame rate."""
-    "second."
     return rrb.Blueprint(
-        views,
-        rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=fps),
+        tabs,
+        rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=3.0),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from modeler.suggestion import Belief, Suggestions
 from modeler.types import RayImage
 from modeler.viz import entities
-from modeler.viz.blueprint import FROM_THE_SIDE, followed
+from modeler.viz.blueprint import FROM_THE_SIDE
 from modeler.viz.drawings import Drawing
 
 WORDS: Final = "next/words"
@@ -23,16 +23,9 @@ _GREY, _ORANGE = (150, 155, 165), (240, 140, 40)
 _SHOWN: Final = 8
 
 
-def draw_next(belief: Belief, found: Suggestions, done: str | None = None) -> Drawing:
-    """Yield drawings of the belief and the suggested actions.
-
-    Args:
-        belief: about poses and surface.
-        found: the suggested actions.
-        done: the previous action in words; None if unknown.
-    """
-    previous = [] if done is None else [f"Done: {done}", ""]
-    lines = [f"**{found.summary}**", "", *previous, *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
+def draw_next(belief: Belief, found: Suggestions) -> Drawing:
+    """Yield drawings of the belief about poses and surface, and of the suggested actions."""
+    lines = [f"**{found.summary}**", "", *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
     yield WORDS, rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     cells, size_m = belief.cells, 0.5 * belief.cells.cell_m
     open_ = belief.can_be_seen & ~cells.seen & ~cells.under
@@ -40,15 +33,6 @@ def draw_next(belief: Belief, found: Suggestions, done: str | None = None) -> Dr
     yield UNSEEN_CELLS, rr.Points3D(cells.points_m[open_], colors=_ORANGE, radii=size_m)
     yield SEEN, rr.Scalars(100.0 * found.seen)
     yield POSE_SD, rr.Scalars(found.pose_deg)
-
-
-def layout(first: RayImage) -> rrb.Blueprint:
-    """Return the layout of a recording of nothing else.
-
-    Args:
-        first: the first view, which sets the viewpoint.
-    """
-    return followed(tab(first), fps=1.0)
 
 
 def tab(first: RayImage | None) -> rrb.Container:

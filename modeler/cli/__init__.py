@@ -27,7 +27,6 @@ from modeler.cli.calibrate_camera import CalibrateCamera
 from modeler.cli.calibrate_sensor import CalibrateSensor
 from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable
 from modeler.cli.convert import Convert
-from modeler.cli.demo_active import DemoActive
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
 from modeler.cli.gallery import Gallery
@@ -55,7 +54,6 @@ Command = (
     | Export
     | Join
     | Suggest
-    | DemoActive
     | Gallery
 )
 
@@ -74,7 +72,6 @@ COMMANDS: dict[str, type[Command]] = {
     "export": Export,
     "join": Join,
     "suggest": Suggest,
-    "demo-active": DemoActive,
     "gallery": Gallery,
 }
 _STYLE = (

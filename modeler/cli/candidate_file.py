@@ -16,7 +16,7 @@ from modeler import se3
 from modeler.priors import HeldPrior
 from modeler.priors import Poke as Push
 from modeler.sequences.input_files import Node, read_text, read_tree
-from modeler.sequences.rendering.recipe import build
+from modeler.sequences.typed_files import build
 from modeler.suggestion import Candidate
 from modeler.types import Array, InputError
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from modeler.cli.inputs import Part
     from modeler.experiment import ModelScore, Pairing, Summary
     from modeler.sequences import AbstractSequence
-    from modeler.sequences.rendering.meshes import Mesh
+    from modeler.sequences.meshes import Mesh
     from modeler.types import AbstractRegistrar, Array
 
 _SAME_M = 1e-5  # to which files of one surface agree

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from modeler.sequences.image_files import read_colour
-from modeler.sequences.rendering.meshes import IntArray, Mesh
+from modeler.sequences.meshes import IntArray, Mesh
 from modeler.types import Array, BoolArray, Float32Array, InputError
 
 STEEP = np.sqrt(0.5)

@@ -11,8 +11,9 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 
 from modeler import se3
+from modeler.sequences.meshes import IntArray, Mesh
 from modeler.sequences.rendering.labels import LabelledMesh, Surfels, gamma_coded, linear_light
-from modeler.sequences.rendering.meshes import Hits, IntArray, Mesh
+from modeler.sequences.rendering.meshes import Hits
 from modeler.types import Array, BoolArray
 
 _CREASE = np.cos(np.radians(30.0))

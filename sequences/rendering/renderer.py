@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.sequences.base import AbstractSequence, span
 from modeler.sequences.bop import write_bop
+from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposure
 from modeler.sequences.rendering.labels import LabelledMesh
-from modeler.sequences.rendering.meshes import Caster, Hits, Mesh, outer_surface, ply_bytes
+from modeler.sequences.rendering.meshes import Caster, Hits, outer_surface, ply_bytes
 from modeler.sequences.rendering.photography import LitMesh, Photography
 from modeler.sequences.rendering.recipe import Mosaic, Recipe
 from modeler.sequences.rendering.shapes import Box, placement

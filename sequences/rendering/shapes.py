@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.sequences.rendering.meshes import IntArray, Mesh, read_mesh
+from modeler.sequences.meshes import IntArray, Mesh, read_mesh
 from modeler.types import Array, BoolArray
 
 

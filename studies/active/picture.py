@@ -12,13 +12,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from modeler.cli.simulated_robot import SimulatedRobot
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.sequences.rendering.recipe import load_recipe
 from modeler.suggestion import Belief, Goal, suggest
 from modeler.types import Array, BoolArray, Step
 from modeler.views import Sensor
+from studies.active.robot import SimulatedRobot
 
 SEEN_RGB, UNSEEN_RGB = np.array([0.62, 0.66, 0.72]), np.array([0.93, 0.55, 0.16])
 ELEVATION, BEHIND_DEG = 0.5, 150.0  # of the eye: slope, and turn from the first camera, to see what that did not

@@ -9,13 +9,13 @@ import argparse
 
 import numpy as np
 
-from modeler.cli.simulated_robot import SimulatedRobot
 from modeler.pipeline import Modeler
 from modeler.priors import PokePrior, TablePrior
 from modeler.suggestion import Candidate
 from modeler.suggestion.candidates import pokes
 from modeler.types import AbstractPrior
 from modeler.views import Sensor
+from studies.active.robot import SimulatedRobot
 from studies.active.trial import REACH_DEG, relative_error_deg, shown, sigma_deg, small
 from studies.calibration.specimens import SPECIMENS, load_specimen
 

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.cli.simulated_robot import SimulatedRobot
 from modeler.pipeline import Modeler
 from modeler.pipeline.modeler import Run
 from modeler.priors import TablePrior
@@ -22,6 +21,7 @@ from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.pose_gain import edge_information
 from modeler.types import Array, Step
 from modeler.views import Sensor
+from studies.active.robot import SimulatedRobot
 from studies.calibration.specimens import load_specimen
 
 Policy = Literal["suggest", "random", "even"]

@@ -24,7 +24,7 @@ from scipy import stats
 from modeler.cli.options import PriorOptions
 from modeler.export import write_atomically
 from modeler.sequences import AbstractSequence
-from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, Frame
 from studies.calibration.by_camera import NOMINAL, chosen, refocused, shown, world_of

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler.cli.options import PriorOptions
 from modeler.sequences import AbstractSequence
-from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.trajectory import AnyTrajectory, Place, Places

@@ -16,7 +16,7 @@ from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import TrueSurface, align_to_model, rotation_error_deg, surface_errors, true_motion
 from modeler.export.report import RunMeta, report_of
 from modeler.sequences import AbstractSequence
-from modeler.sequences.rendering.meshes import Mesh
+from modeler.sequences.meshes import Mesh
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel, Step
 from studies.trust.plan import Half, Plan
 from studies.trust.stage import Recorded
