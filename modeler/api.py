@@ -11,14 +11,14 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.cli import compose
-from modeler.cli.advice import comes_back
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
-from modeler.cli.outputs import check_run_folder
+from modeler.composition import compose
+from modeler.composition.compose import comes_back
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, RunMeta, alone
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
+from modeler.runs.outputs import check_run_folder
 from modeler.sequences import AbstractSequence
 from modeler.sequences import open_sequence as opened
 from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step, Verdict

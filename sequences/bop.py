@@ -293,6 +293,14 @@ def _numbered(root: Path, name: str, suffixes: tuple[str, ...]) -> dict[int, Pat
     return found
 
 
+_UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)  # of stored depth
+
+
+def finest_unit_mm(farthest_m: float) -> float:
+    """Return the finest unit of depth, in mm, in which a depth fits into 16 bits."""
+    return next((unit for unit in _UNITS_MM if farthest_m * 1000.0 < 65535.0 * unit), _UNITS_MM[-1])
+
+
 def write_bop(
     folder: Path,
     frames: Iterable[Frame],

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from modeler.cli.jobs import ENDED, Job, write_note
+from modeler.batch.jobs import ENDED, Job, write_note
 from modeler.cli.one_job import begin, end_with_the_parent
 
 BOOK = "book.txt"
@@ -21,7 +21,8 @@ BOOK = "book.txt"
 PATIENCE_S = 60.0
 _STARTED = """
 import sys
-from modeler.cli import jobs, main
+from modeler.batch import jobs
+from modeler.cli import main
 jobs.BUILDER = "fake_builder"
 sys.exit(main(sys.argv[1:]))
 """

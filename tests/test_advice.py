@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from modeler import priors, se3
-from modeler.cli.advice import remedies, unchecked_focal_length, visible_frames
 from modeler.cli.build import Build
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import AbstractPrior, Outcome
+from modeler.verdict.advice import remedies, unchecked_focal_length, visible_frames
 
 
 def untrusted(

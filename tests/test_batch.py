@@ -15,11 +15,12 @@ import pytest
 from command_runner import QUICK, Run
 from fake_builder import PATIENCE_S, book, sequence, started, wait_for
 
-from modeler.cli import engines, jobs, parsed
+from modeler.batch import engines, jobs
+from modeler.batch.jobs import NOTES, Job, fingerprint, standing
+from modeler.batch.models import TABLE, models_in
+from modeler.cli import parsed
 from modeler.cli.batch import Batch
-from modeler.cli.jobs import NOTES, Job, fingerprint, standing
 from modeler.cli.manifest import Row, named, read_manifest
-from modeler.cli.models import TABLE, models_in
 from modeler.export.models_table import read_table
 from modeler.types import InputError
 from studies.kills.trials import SAME

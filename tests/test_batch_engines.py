@@ -16,7 +16,7 @@ import pytest
 from command_runner import QUICK
 from fake_builder import book, sequence, started, wait_for
 
-from modeler.cli.models import TABLE
+from modeler.batch.models import TABLE
 from modeler.export.models_table import read_table
 
 HERE = Path(__file__).parent
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 WORKER = """
 import sys
-from modeler.cli import jobs
+from modeler.batch import jobs
 from distributed.cli.dask_worker import main
 jobs.BUILDER = "fake_builder"
 {more}

@@ -14,7 +14,7 @@ from command_runner import Run
 
 from modeler import priors
 from modeler.cli import main, parsed
-from modeler.cli.options import PriorOptions
+from modeler.composition.options import PriorOptions
 
 COMMANDS = (
     "build batch gallery register evaluate render view report export join info convert calibrate-sensor "

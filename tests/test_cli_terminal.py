@@ -22,14 +22,14 @@ import pytest
 from command_runner import BOX, QUICK
 
 from modeler.cli import main
-from modeler.cli.advice import outcome_advice
-from modeler.cli.compose import check_region
 from modeler.cli.console import Console, Interrupt
 from modeler.cli.info import Info
-from modeler.cli.inputs import reading
-from modeler.cli.options import ObjectOptions
+from modeler.cli.reading import reading
+from modeler.composition.compose import check_region
+from modeler.composition.options import ObjectOptions
 from modeler.sequences import bundled, open_sequence
 from modeler.types import Failed, Outcome, PriorRefused, Reason, Searching, Segmentation, Solution, Step
+from modeler.verdict.advice import outcome_advice
 
 COMMAND = [sys.executable, "-m", "modeler"]
 FEW = Outcome.TOO_FEW_POINTS
@@ -119,7 +119,7 @@ def on_a_terminal(command: list[str]) -> str:
 
 
 WATCHED = """
-from modeler.cli.compose import check_region
+from modeler.composition.compose import check_region
 from modeler.cli.console import Console, Interrupt
 from modeler.types import Fusing, Refining, Searching
 with Console(25, None) as console:
@@ -336,7 +336,7 @@ def test_what_was_compiled_ahead_is_all_that_a_run_needs(tmp_path: Path) -> None
     def kept() -> dict[Path, int]:
         return {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("kernels-*/*")}
 
-    ahead = "from modeler.cli.compiling import compile_kernels; compile_kernels()"
+    ahead = "from modeler.cli.console import say; from modeler.runs import compiling; compiling.compile_kernels(say)"
     done = subprocess.run([sys.executable, "-c", ahead], env=environment, capture_output=True, text=True, check=True)
     counts = re.findall(r"compiling kernels, once on this machine: (\d+) of (\d+)", done.stderr)
     assert counts == [(str(k + 1), str(len(counts))) for k in range(len(counts))]

@@ -16,10 +16,10 @@ import trimesh
 
 from modeler import se3
 from modeler.cli import main
-from modeler.cli.inputs import reopened
 from modeler.export import RunFolder, RunMeta, alone, pose_file
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
+from modeler.runs.reopening import reopened
 from modeler.sequences import BopSequence, write_bop
 from modeler.sequences.rendering.recipe import Recipe, Table, Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence

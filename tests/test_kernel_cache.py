@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from modeler import kernels
-from modeler.cli import compiling
+from modeler.cli.console import say
 from modeler.kernels import cache
+from modeler.runs import compiling
 
 _INNER = "from toy.cache import njit\n\n\n@njit(cache=True, inline='always')\ndef inner(x):\n    return x + {}\n"
 _OUTER = """\
@@ -133,7 +134,7 @@ def test_that_kernels_cannot_be_kept_is_said(
     monkeypatch.setattr(cache, "writable", lambda: False)
     reports: list[Callable[[str], None]] = []
     monkeypatch.setattr(kernels, "on_compiling", reports.append)
-    compiling.compile_kernels()
+    compiling.compile_kernels(say)
     assert capsys.readouterr().err.startswith(f"modeler: compiled kernels cannot be kept in {cache.folder()}")
     reports[0]("tsdf")
     assert "compiling kernels, for this command alone: 1 of" in capsys.readouterr().err

@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from modeler import kernels, se3
-from modeler.cli import compiling
 from modeler.kernels import (
     cache,
     gauss_newton,
@@ -22,6 +21,7 @@ from modeler.kernels import (
 )
 from modeler.kernels.point_likelihood import Projection
 from modeler.registration.visibility.sampling import GaussianMixture
+from modeler.runs import compiling
 from modeler.se3 import matrices, rows
 
 INTRINSICS = np.array([40.0, 42.0, 9.3, 7.1])

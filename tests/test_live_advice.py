@@ -15,9 +15,9 @@ from rerun_recordings import read
 from rich.console import Console as Terminal
 
 from modeler.cli.console import Console
-from modeler.cli.live_advice import advising, summary_of
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
+from modeler.runs.live_advice import advising, summary_of
 from modeler.sequences import bundled, open_sequence
 from modeler.suggestion import Belief, Candidate, Suggestions, suggest
 from modeler.types import Failed, Outcome, Step

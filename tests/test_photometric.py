@@ -10,7 +10,7 @@ from scipy import ndimage
 import modeler
 from modeler import se3
 from modeler.cli.build import Build
-from modeler.cli.options import MethodOptions
+from modeler.composition.options import MethodOptions
 from modeler.kernels import bands, gauss_newton, point_to_plane, scores
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior

@@ -15,8 +15,8 @@ import pytest
 from input_errors import refused
 
 from modeler.cli import main
-from modeler.cli.compose import chosen_prior, prior_name
-from modeler.cli.options import PriorOptions
+from modeler.composition.compose import chosen_prior, prior_name
+from modeler.composition.options import PriorOptions
 from modeler.priors import (
     AnyMotion,
     AnyTurn,

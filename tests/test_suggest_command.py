@@ -9,7 +9,7 @@ import pytest
 from command_runner import Run
 from input_errors import refused
 
-from modeler.cli.candidate_file import read_candidates
+from modeler.composition.candidate_file import read_candidates
 
 FIELDS = {"action", "gain_nats", "new_surface", "words"}
 POSE = [1.0, 0.0, 0.0, 0.01, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from modeler import se3
-from modeler.cli.advice import outcome_advice
 from modeler.evaluation import about_point, nees, rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import bundled, open_sequence
 from modeler.types import Camera, Frame, Outcome
+from modeler.verdict.advice import outcome_advice
 from modeler.views import Sensor
 
 

@@ -23,20 +23,17 @@ import tyro
 
 from modeler.cli.batch import Batch
 from modeler.cli.build import Build
-from modeler.cli.calibrate_camera import CalibrateCamera
-from modeler.cli.calibrate_sensor import CalibrateSensor
+from modeler.cli.calibrate import CalibrateCamera, CalibrateSensor
 from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable
 from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
-from modeler.cli.gallery import Gallery
 from modeler.cli.info import Info
 from modeler.cli.join import Join
+from modeler.cli.pages import Gallery, Report, View
 from modeler.cli.register import Register
 from modeler.cli.render import Render
-from modeler.cli.report import Report
 from modeler.cli.suggest import Suggest
-from modeler.cli.view import View
 from modeler.system.address_space import check_room, share_one_heap
 
 Command = (
@@ -194,7 +191,7 @@ def _run(command: Command) -> int:
     _check_environment()
     check_room(_ROOM)
     with interruptible_at_once():
-        importlib.import_module("modeler.viz.viewer" if isinstance(command, View) else "modeler.cli.inputs")
+        importlib.import_module("modeler.viz.viewer" if isinstance(command, View) else "modeler.cli.reading")
         from modeler.types import InputError
     try:
         with terminable():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,23 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from modeler.cli.console import bar, say
-from modeler.cli.options import (
-    FrameOptions,
-    MethodOptions,
-    ModelOptions,
-    ObjectOptions,
-    PriorOptions,
-    as_arguments,
-    default,
-)
+from modeler.cli.options import FrameOptions, ModelOptions, as_arguments
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 
 if TYPE_CHECKING:
-    from modeler.cli.jobs import Ended, Job
+    from modeler.batch.jobs import Ended, Job
 
 _OVER = ("done", "failed")
 _LISTED = 20  # sequences without a good model that are listed individually
-_LOSSES = 3  # how often an engine may lose a job
-_RETURNS_S = 120.0  # time to wait for a lost engine
 
 
 @dataclass(frozen=True)
@@ -76,12 +67,13 @@ class Batch:
             InputError: if options, the manifest, the engine or the folder cannot be used.
             KeyboardInterrupt: after the finished sequences have been listed.
         """
-        from modeler.cli.compiling import compile_kernels
-        from modeler.cli.engines import check_engine, is_here
-        from modeler.cli.jobs import ended, read_note, standing
-        from modeler.cli.models import write_models
-        from modeler.cli.outputs import check_folder
+        from modeler.batch.engines import check_engine, is_here
+        from modeler.batch.jobs import ended, read_note, standing
+        from modeler.batch.models import write_models
+        from modeler.batch.work import results
         from modeler.export import alone
+        from modeler.runs.compiling import compile_kernels
+        from modeler.runs.outputs import check_folder
         from modeler.types import InputError
 
         if self.workers is not None and self.workers < 1:
@@ -106,11 +98,11 @@ class Batch:
             if not waiting:
                 say(words)
             elif is_here(self.executor):
-                compile_kernels()  # once, not in every build
+                compile_kernels(say)  # once, not in every build
             try:
                 with bar() as progress:
                     task = progress.add_task("", total=len(jobs), completed=len(ends))
-                    for one in _work(self, waiting, words):
+                    for one in results(waiting, self.executor, self.workers, lambda: say(words), say):
                         ends.append(one)
                         progress.update(task, advance=1, description=one.name)
             finally:
@@ -128,8 +120,8 @@ def _jobs(options: Batch) -> list[Job]:
     Raises:
         InputError: if there is none, or the manifest cannot be used.
     """
-    from modeler.cli.engines import threads_of, usual_workers
-    from modeler.cli.jobs import Job
+    from modeler.batch.engines import threads_of, usual_workers
+    from modeler.batch.jobs import Job
     from modeler.cli.manifest import Row, named, read_manifest
     from modeler.types import InputError
 
@@ -153,77 +145,6 @@ def _jobs(options: Batch) -> list[Job]:
         )
         for name, row in named(rows, options.out).items()
     ]
-
-
-def _work(options: Batch, jobs: Sequence[Job], words: str) -> Iterator[Ended]:
-    """Yield the end of each job as it occurs; a lost engine is awaited.
-
-    Args:
-        options: with the engine.
-        jobs: to run.
-        words: message once the engine is open.
-
-    Raises:
-        InputError: if it cannot be opened, or does not come back.
-    """
-    import time
-
-    from modeler.cli.engines import engine
-    from modeler.cli.jobs import PROCESSES
-    from modeler.types import InputError
-
-    waiting, losses = {job.name: job for job in jobs}, Counter[str]()
-    given_up_s = 0.0
-    while waiting:
-        try:
-            with engine(options.executor, options.workers) as executor, PROCESSES.ended():
-                if not given_up_s:
-                    say(words)
-                yield from _until_lost(executor, waiting, losses)
-        except InputError:
-            if time.monotonic() > given_up_s:
-                raise
-            time.sleep(1.0)
-            continue
-        if waiting:
-            say("the connection to the engine was lost: waiting for it")
-            given_up_s = time.monotonic() + _RETURNS_S
-
-
-def _until_lost(executor: object, waiting: dict[str, Job], losses: Counter[str]) -> Iterator[Ended]:
-    """Yield how jobs ended, and take them off those that wait; return early where the engine is lost."""
-    from concurrent.futures import CancelledError, Executor, Future
-    from queue import SimpleQueue
-
-    from modeler.cli.jobs import TRIES, run, write_failure
-
-    assert isinstance(executor, Executor)
-    ended: SimpleQueue[tuple[Job, Future[Ended | None]]] = SimpleQueue()
-
-    def submit(job: Job) -> None:
-        executor.submit(run, job).add_done_callback(lambda future: ended.put((job, future)))
-
-    for job in waiting.values():
-        submit(job)
-    while waiting:
-        job, future = ended.get()
-        try:
-            one = future.result()
-        except Exception as error:  # whatever an engine raises
-            losses[job.name] += 1
-            if losses[job.name] <= _LOSSES:
-                if isinstance(error, CancelledError):
-                    return
-                submit(job)
-                continue
-            one = write_failure(job, f"the engine lost it ({type(error).__name__}: {error})")
-        if one is None:
-            continue
-        if one.status not in (0, 3) and one.tries < TRIES:
-            submit(job)
-            continue
-        del waiting[job.name]
-        yield one
 
 
 def _summarise(options: Batch, ends: Sequence[Ended]) -> int:

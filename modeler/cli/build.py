@@ -13,17 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from modeler.cli.compiling import compile_kernels
 from modeler.cli.console import Console, Interrupt, say
-from modeler.cli.options import (
-    MIN_VOXEL_M,
-    FrameOptions,
-    MethodOptions,
-    ModelOptions,
-    ObjectOptions,
-    PriorOptions,
-    default,
-)
+from modeler.cli.options import MIN_VOXEL_M, FrameOptions, ModelOptions
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
+from modeler.runs.compiling import compile_kernels
 
 if TYPE_CHECKING:
     from modeler.export import RunFolder, RunMeta
@@ -75,10 +68,10 @@ class Build:
         Raises:
             InputError: if the input or the folder cannot be used.
         """
-        from modeler.cli import compose
-        from modeler.cli.inputs import estimated_camera
-        from modeler.cli.outputs import check_run_folder
+        from modeler.composition import compose
         from modeler.export import PairCache, RunFolder, RunMeta, alone
+        from modeler.runs.outputs import check_run_folder
+        from modeler.runs.reopening import estimated_camera
         from modeler.system.concurrency import in_parallel
         from modeler.viz.stream import load
 
@@ -101,7 +94,7 @@ class Build:
             RunFolder(self.out).pairs.drop()  # left over from a kill at the very end
             say("the run is already complete; give --overwrite to build it again")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
-        compile_kernels()
+        compile_kernels(say)
         scene, _ = in_parallel(partial(compose.scene, modeler, whole), load)
         with alone(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
@@ -169,7 +162,8 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     Raises:
         InputError: if something cannot be read.
     """
-    from modeler.cli.inputs import calibrated, watched
+    from modeler.cli.reading import watched
+    from modeler.runs.reopening import calibrated
     from modeler.sequences import KeptSequence, Overrides, frame_range, open_sequence, survey
     from modeler.types import InputError
 
@@ -202,9 +196,9 @@ def _run(
         InputError: if a frame cannot be read or a file cannot be written.
         KeyboardInterrupt: if the user interrupted before the first frame.
     """
-    from modeler.cli.advice import comes_back
-    from modeler.cli.inputs import while_it_lasts
-    from modeler.cli.live_advice import advising
+    from modeler.cli.reading import while_it_lasts
+    from modeler.composition.compose import comes_back
+    from modeler.runs.live_advice import advising
     from modeler.system.concurrency import in_background
     from modeler.types import Step
     from modeler.viz.stream import open_stream
@@ -280,7 +274,8 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt, *, live: bo
 
 def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) -> int:
     """Write a summary of the run to stderr, and return the exit status."""
-    from modeler.cli.advice import (
+    from modeler.types import ACCEPTED
+    from modeler.verdict.advice import (
         estimated_focal_length,
         measured_step,
         remedies,
@@ -288,7 +283,6 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
         unchecked_focal_length,
         visible_frames,
     )
-    from modeler.types import ACCEPTED
 
     accepted = sum(frame["outcome"] == ACCEPTED for frame in report["frames"])
     loop = "loop closed" if report["closed"] else "no loop closed"

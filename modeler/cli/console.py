@@ -178,8 +178,8 @@ class Console:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Stop the bar, and report the number of frames with unsure masks."""
-        from modeler.cli.advice import outcome_advice
         from modeler.types import Outcome
+        from modeler.verdict.advice import outcome_advice
 
         self._bar.stop()
         self._release()
@@ -194,7 +194,7 @@ class Console:
 
     def advise(self, step: Step, belief: Belief, found: Suggestions) -> None:
         """Show the next action after a step; the first time the goal is reached, print it."""
-        from modeler.cli.live_advice import summary_of
+        from modeler.runs.live_advice import summary_of
 
         if found.reached and not self._enough:
             self._enough = True
@@ -266,8 +266,8 @@ class Console:
 
     def _why(self, reason: Reason, posteriors: Sequence[Posterior]) -> str:
         """Return why a frame was left out, with advice unless already given."""
-        from modeler.cli.advice import reason_advice
         from modeler.types import summary
+        from modeler.verdict.advice import reason_advice
 
         what, what_to_do = summary(reason), reason_advice(reason, self._prior, posteriors)
         if not what_to_do or what_to_do in self._advised:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from modeler.cli.console import say
-from modeler.cli.options import FrameOptions, InputOptions, default
+from modeler.cli.options import FrameOptions, InputOptions
+from modeler.composition.options import default
 
 if TYPE_CHECKING:
     from modeler.sequences import AbstractSequence
 
-UNITS_MM = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 10.0)
-"""Depth is written in the finest of these in which it fits into 16 bits."""
 LIVE_REACH_M = 16.0
 """Depth of a live camera beyond this is a measurement error."""
 
@@ -48,9 +47,10 @@ class Convert:
         Raises:
             InputError: if the input cannot be used or the output cannot be written.
         """
-        from modeler.cli.inputs import calibrated, reading, while_it_lasts
-        from modeler.cli.outputs import check_files, check_folder, run_inputs
-        from modeler.sequences import frame_range, open_sequence, survey, write_bop
+        from modeler.cli.reading import reading, while_it_lasts
+        from modeler.runs.outputs import check_files, check_folder, run_inputs
+        from modeler.runs.reopening import calibrated
+        from modeler.sequences import finest_unit_mm, frame_range, open_sequence, survey, write_bop
         from modeler.system.regular_files import read_regular
         from modeler.types import InputError
 
@@ -90,11 +90,6 @@ class Convert:
         for note in (*found.doubts, *sequence.notes):
             say(note)
         return 0
-
-
-def finest_unit_mm(farthest_m: float) -> float:
-    """Return the finest unit of depth, in mm, in which a depth fits into 16 bits."""
-    return next((unit for unit in UNITS_MM if farthest_m * 1000.0 < 65535.0 * unit), UNITS_MM[-1])
 
 
 def _meta(sequence: AbstractSequence) -> dict[str, object]:

@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
-from modeler.cli.compiling import compile_kernels
 from modeler.cli.console import bar, say
-from modeler.cli.options import OF_EXTRAS, SEED, FrameOptions, Method, ObjectOptions, PriorOptions, StrictPaths, default
+from modeler.cli.options import FrameOptions, StrictPaths
+from modeler.composition.options import OF_EXTRAS, SEED, Method, ObjectOptions, PriorOptions, default
+from modeler.runs.compiling import compile_kernels
 
 if TYPE_CHECKING:
-    from modeler.cli.inputs import Part
     from modeler.experiment import ModelScore, Pairing, Summary
     from modeler.sequences import AbstractSequence
-    from modeler.sequences.meshes import Mesh
-    from modeler.types import AbstractRegistrar, Array
-
-_SAME_M = 1e-5  # to which files of one surface agree
+    from modeler.types import AbstractRegistrar
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,7 @@ class Evaluate:
         Raises:
             InputError: if an option, a sequence or the folder cannot be used.
         """
-        from modeler.cli.outputs import check_files, run_inputs
+        from modeler.runs.outputs import check_files, run_inputs
         from modeler.types import InputError
 
         if not self.sequences:
@@ -100,7 +97,7 @@ class Evaluate:
 def _evaluate_pairs(options: Evaluate) -> int:
     """Register pairs of frames by each method, write their errors, print a table and return the exit status."""
     from modeler import experiment
-    from modeler.cli import compose
+    from modeler.composition import compose
     from modeler.experiment import Experiment, Pairing
     from modeler.sequences import Overrides, frame_range, open_sequence
     from modeler.viz import figures
@@ -121,7 +118,7 @@ def _evaluate_pairs(options: Evaluate) -> int:
         seed=options.seed,
     )
     _check_offsets(plan.pairing, recorded)
-    compile_kernels()
+    compile_kernels(say)
     with bar() as progress:
         task = progress.add_task("", total=sum(plan.size(sequence) for sequence in recorded))
         rows = experiment.evaluate(
@@ -181,7 +178,7 @@ def columns(lines: Sequence[tuple[str, ...]], *, left: int) -> str:
 
 def _methods(names: str) -> dict[str, AbstractRegistrar]:
     """Return registrars by name from a list with commas."""
-    from modeler.cli import compose
+    from modeler.composition import compose
     from modeler.types import InputError
 
     known: dict[str, Method] = {name: name for name in get_args(Method)}
@@ -230,12 +227,13 @@ def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
     """
     from modeler.experiment import models_csv, models_json
     from modeler.export import write_atomically
+    from modeler.runs.scoring import scores_of
     from modeler.types import InputError
 
     scores, left_out = [], []
     for path in runs:
         try:
-            scores += _scores(path, seed)
+            scores += scores_of(path, seed)
         except InputError as error:
             if len(runs) == 1:
                 raise
@@ -252,57 +250,6 @@ def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
     for line in left_out:
         say(line)
     return 2 if left_out else 0
-
-
-def _scores(path: Path, seed: int) -> list[ModelScore]:
-    """Judge the model of one run.
-
-    Raises:
-        InputError: if something cannot be read, or is not known.
-    """
-    from modeler.cli.inputs import reopened
-    from modeler.experiment import Modelled, model_scores
-    from modeler.export import mesh_of, read_model
-    from modeler.fusion import Fuser
-
-    run = reopened(path)
-    truth, mesh = _truth(path, run.parts)
-    modelled = Modelled(
-        name=str(path),
-        model=read_model(mesh_of(path)),
-        views=run.views,
-        trajectory=run.solution.trajectory,
-        camera_from_model=truth,
-        truth=(mesh.vertices_m, mesh.triangles),
-    )
-    return model_scores(modelled, Fuser(voxel_m=run.report["settings"].get("voxel_m")), seed)
-
-
-def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
-    """Return the true camera_from_model (4, 4) by frame number, and the true surface.
-
-    Raises:
-        InputError: if a part of the run does not know them, or parts that were joined know different surfaces.
-    """
-    from modeler.sequences import true_mesh
-    from modeler.types import InputError
-
-    poses: dict[int, Array] = {}
-    meshes: list[Mesh] = []
-    for part in parts:
-        truth = part.truth()
-        if truth is None:
-            raise InputError(f"{part.sequence.name}: has no ground truth to compare with; add scene_gt.json.")
-        poses |= truth
-        meshes.append(true_mesh(part.sequence))
-    first = meshes[0].vertices_m
-    for part, mesh in zip(parts, meshes, strict=True):
-        if mesh.vertices_m.shape != first.shape or abs(mesh.vertices_m - first).max() > _SAME_M:
-            raise InputError(
-                f"{run}: {parts[0].sequence.name} and {part.sequence.name}, of which it is joined, have different true "
-                "surfaces; evaluate the runs it joins"
-            )
-    return poses, meshes[0]
 
 
 def _models_table(scores: Sequence[ModelScore]) -> list[tuple[str, ...]]:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from modeler.cli.console import say
-from modeler.cli.options import MIN_VOXEL_M, MovedOptions, default
+from modeler.cli.options import MIN_VOXEL_M, MovedOptions
+from modeler.composition.options import default
 
 Origin = Literal["camera", "base", "centre", "bbox"]  # spelt out here, for help imports nothing heavy
 Up = Literal["z", "y"]
@@ -75,8 +76,8 @@ class Export:
         if self.purpose is not None:
             return self._for(self.purpose)
         from modeler import export as files
-        from modeler.cli.outputs import check_files, run_inputs
         from modeler.export.mesh import TRIANGLES
+        from modeler.runs.outputs import check_files, run_inputs
         from modeler.types import InputError
 
         _check(self)
@@ -129,10 +130,25 @@ class Export:
         Raises:
             InputError: if options exclude each other, or something cannot be read or written.
         """
-        from modeler.cli.presets import Preset
+        from modeler.runs.presets import Preset
 
         _check_numbers(self)
-        return Preset(self, purpose).run()
+        _check_preset(self, purpose)
+        checks = Preset(
+            self.run_folder,
+            self.out,
+            purpose,
+            say,
+            overwrite=self.overwrite,
+            triangles=self.triangles,
+            texture_px=self.texture_px,
+            voxel_m=self.voxel_m,
+            density_kg_m3=self.density_kg_m3,
+            mass_kg=self.mass_kg,
+            sequences=self.moved.sequence,
+        ).write()
+        say(checks.words)
+        return 3 if checks.failed else 0
 
 
 def texture_words(texture: Texture, volume: FusionVolume) -> str:
@@ -167,6 +183,19 @@ def _check(options: Export) -> None:
     _check_numbers(options)
 
 
+def _check_preset(options: Export, purpose: Purpose) -> None:
+    """Refuse options that a preset decides on, or that go with other presets."""
+    from modeler.types import InputError
+
+    given = [name for name in ("origin", "up", "watertight", "texture", "bop", "tint") if getattr(options, name)]
+    if given:
+        raise InputError(f"--for {purpose} decides on --{given[0]}; leave it out")
+    bodies = {"density-kg-m3": options.density_kg_m3, "mass-kg": options.mass_kg}
+    of_bodies = [name for name, value in bodies.items() if value is not None]
+    if of_bodies and purpose not in ("mujoco", "urdf"):
+        raise InputError(f"--{of_bodies[0]} goes with --for mujoco and --for urdf alone")
+
+
 def _check_numbers(options: Export) -> None:
     """Refuse numbers that are out of range."""
     from modeler.types import InputError
@@ -188,8 +217,8 @@ def _volume(options: Export) -> FusionVolume | None:
     """Return the views of the run, if the mesh has to be fused again."""
     if not (options.watertight or options.texture or options.voxel_m is not None):
         return None
-    from modeler.cli.inputs import reopened
     from modeler.fusion import Fuser
+    from modeler.runs.reopening import reopened
 
     run = reopened(options.run_folder, options.moved.sequence)
     return run.volume(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))

@@ -36,7 +36,7 @@ class Info:
         """
         from json import dumps
 
-        from modeler.cli.inputs import reading
+        from modeler.cli.reading import reading
         from modeler.sequences import open_sequence, survey
 
         sequence = open_sequence(self.input, self.given.overrides())

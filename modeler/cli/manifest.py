@@ -12,15 +12,9 @@ from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 
-from modeler.cli.jobs import NOTES, read_note
-from modeler.cli.options import (
-    FrameOptions,
-    MethodOptions,
-    ModelOptions,
-    ObjectOptions,
-    PriorOptions,
-    as_arguments,
-)
+from modeler.batch.jobs import NOTES, read_note
+from modeler.cli.options import FrameOptions, ModelOptions, as_arguments
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import InputError
 
 _GROUPS = (ModelOptions, PriorOptions, MethodOptions, FrameOptions, ObjectOptions)

@@ -14,20 +14,20 @@ import time
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from modeler.cli.jobs import Job
+    from modeler.batch.jobs import Job
 
 
 def main() -> int:
     """Build the sequence of a job, and note the result; the exit status is that of the build."""
     began_s = time.perf_counter()
     threading.Thread(target=end_with_the_parent, daemon=True).start()
+    from modeler.batch.jobs import ENDED, write_note
     from modeler.cli import main as command
-    from modeler.cli.jobs import ENDED, write_note
 
     job, note = begin(sys.argv[1])
     status = command(["build", job.sequence, "--out", str(job.run), "--resume", *job.arguments])
     if status in ENDED:
-        from modeler.cli.models import record_of
+        from modeler.batch.models import record_of
 
         if job.page:
             command(["report", str(job.run), "--overwrite"])
@@ -42,7 +42,7 @@ def begin(words: str) -> tuple[Job, dict[str, Any]]:
     Args:
         words: the job in JSON.
     """
-    from modeler.cli.jobs import Job, fingerprint, read_note, standing, write_note
+    from modeler.batch.jobs import Job, fingerprint, read_note, standing, write_note
 
     values = json.loads(words)
     job = Job(**{**values, "arguments": tuple(values["arguments"])})

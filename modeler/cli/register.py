@@ -9,9 +9,10 @@ from typing import Annotated
 
 import tyro
 
-from modeler.cli.compiling import compile_kernels
 from modeler.cli.console import say
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions, StrictPaths
+from modeler.cli.options import StrictPaths
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.runs.compiling import compile_kernels
 
 
 @dataclass(frozen=True)
@@ -34,17 +35,17 @@ class Register:
 
     def run(self) -> int:
         """Register the pair; status 3 if the result would not become an edge."""
-        from modeler.cli import compose
-        from modeler.cli.advice import outcome_advice
+        from modeler.composition import compose
         from modeler.export import edge_record
         from modeler.sequences import Overrides, open_sequence
         from modeler.types import Edge, InputError, Solution, Stated
+        from modeler.verdict.advice import outcome_advice
 
         if self.source == self.target:
             raise InputError(f"SOURCE and TARGET are both frame {self.source}; name two frames")
         sequence = open_sequence(self.sequence, Overrides(strict_paths=self.strict_paths))
         modeler = compose.modeler(sequence, self.prior, self.method, self.where)
-        compile_kernels()
+        compile_kernels(say)
         scene = compose.scene(modeler, sequence)
         views = []
         for index in (self.source, self.target):

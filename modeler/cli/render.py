@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from modeler.cli.options import SEED, default
+from modeler.composition.options import SEED, default
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Render:
 
     def run(self) -> int:
         """Render the sequence."""
-        from modeler.cli.inputs import reading
-        from modeler.cli.outputs import check_folder
+        from modeler.cli.reading import reading
+        from modeler.runs.outputs import check_folder
         from modeler.sequences.rendering.recipe import load_recipe
         from modeler.sequences.rendering.renderer import render
 

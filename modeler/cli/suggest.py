@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from modeler.cli.console import say
-from modeler.cli.options import MovedOptions, default
+from modeler.cli.options import MovedOptions
+from modeler.composition.options import default
 
 if TYPE_CHECKING:
     from modeler.suggestion import Goal
@@ -49,8 +50,8 @@ class Suggest:
         Raises:
             InputError: if the run or the candidates cannot be used.
         """
-        from modeler.cli.candidate_file import read_candidates
-        from modeler.cli.inputs import reopened
+        from modeler.composition.candidate_file import read_candidates
+        from modeler.runs.reopening import reopened
         from modeler.suggestion import suggest
         from modeler.types import InputError
 

@@ -21,9 +21,9 @@ from typing import Final, final
 import numpy as np
 
 from modeler import se3
-from modeler.cli import compose
-from modeler.cli.advice import comes_back
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.composition import compose
+from modeler.composition.compose import comes_back
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, translation_error_m, true_motion
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Step

@@ -17,8 +17,8 @@ from rosbags import rosbag1, rosbag2
 from modeler import se3, sequences
 from modeler.cli import main
 from modeler.cli.convert import Convert
-from modeler.cli.inputs import solved
 from modeler.export import RunFolder, edges_of, poses_of
+from modeler.runs.reopening import solved
 from modeler.sequences import open_sequence, read_noise, survey, write_bop
 from modeler.sequences.image_folders import trajectory
 from modeler.sequences.rendering.recipe import load_recipe

@@ -10,8 +10,8 @@ from typing import Final, Literal, final
 import numpy as np
 
 from modeler import se3
-from modeler.cli import compose
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.composition import compose
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import HeldPrior
 from modeler.sequences import AbstractSequence

@@ -19,9 +19,9 @@ from typing import Final
 import numpy as np
 
 from modeler import se3
-from modeler.cli import compose
 from modeler.cli.build import DRAWING_SHARE
-from modeler.cli.options import MethodOptions, ObjectOptions
+from modeler.composition import compose
+from modeler.composition.options import MethodOptions, ObjectOptions
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export import RunFolder, RunMeta
 from modeler.pipeline import NewestFrames

@@ -21,7 +21,7 @@ from typing import Final, final
 import numpy as np
 from scipy import stats
 
-from modeler.cli.options import PriorOptions
+from modeler.composition.options import PriorOptions
 from modeler.export import write_atomically
 from modeler.sequences import AbstractSequence
 from modeler.sequences.meshes import Mesh

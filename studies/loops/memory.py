@@ -17,8 +17,9 @@ import time
 from pathlib import Path
 from typing import Any, ClassVar
 
-from modeler.cli import build, compose, main
+from modeler.cli import build, main
 from modeler.cli.console import Console
+from modeler.composition import compose
 from modeler.sequences import open_sequence, write_bop
 from modeler.types import Step
 from studies.loops.cases import turned

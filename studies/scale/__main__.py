@@ -23,8 +23,8 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
-from modeler.cli.engines import engine
-from modeler.cli.jobs import NOTES, Job, fingerprint, write_note
+from modeler.batch.engines import engine
+from modeler.batch.jobs import NOTES, Job, fingerprint, write_note
 from modeler.sequences.rendering.recipe import load_recipe
 from modeler.sequences.rendering.renderer import render
 

@@ -9,8 +9,8 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from modeler.cli import compose
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.composition import compose
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.renderer import RenderedSequence, matrix_of, place_of
 from modeler.sequences.rendering.shapes import Box, Compound, Part, placement

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from modeler import se3
-from modeler.cli.options import PriorOptions
+from modeler.composition.options import PriorOptions
 from modeler.sequences.rendering.recipe import Recipe, Table, Wall
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import AnyShape, Box, Capsule, Cylinder

@@ -19,10 +19,10 @@ import numpy as np
 
 from modeler import se3, sequences
 from modeler.cli import main as modeler
-from modeler.cli.inputs import reopened
 from modeler.evaluation import TrueSurface, align_to_model, surface_errors
 from modeler.export import write_atomically
 from modeler.fusion import Fuser
+from modeler.runs.reopening import reopened
 from modeler.sequences import true_mesh
 from modeler.types import Array, RayImage
 from studies.surfacing.cost import measured

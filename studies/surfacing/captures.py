@@ -21,11 +21,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, sobel
 
 from modeler import se3
-from modeler.cli.inputs import Reopened, reopened
 from modeler.export import write_atomically
 from modeler.fusion import Fuser, FusionVolume, meshing
 from modeler.fusion.depth_views import free_of
 from modeler.kernels.photometric import harmonics_of
+from modeler.runs.reopening import Reopened, reopened
 from modeler.types import Array, BoolArray, RayImage
 from studies.surfacing.drawing import Scene
 from studies.surfacing.methods import Surface, open3d_poisson, open3d_tsdf

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from modeler.cli.inputs import reopened
 from modeler.export import read_model
+from modeler.runs.reopening import reopened
 from modeler.sequences.image_files import write_image
 from modeler.types import Camera, Frame
 from studies.surfacing.drawing import Scene

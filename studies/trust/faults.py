@@ -9,7 +9,7 @@ from typing import Final, final
 import numpy as np
 from scipy import ndimage
 
-from modeler.cli.options import PriorOptions
+from modeler.composition.options import PriorOptions
 from modeler.sequences.rendering.recipe import Recipe, Wall
 from modeler.sequences.rendering.shapes import AnyShape, Box, Capsule, Compound, Part
 from modeler.sequences.rendering.trajectory import Place, Places, Tabletop, Turntable

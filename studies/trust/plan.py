@@ -8,7 +8,7 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from modeler.cli.options import PriorOptions
+from modeler.composition.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.sequences.rendering.depth_sensor import DepthSensor
 from modeler.sequences.rendering.recipe import Recipe

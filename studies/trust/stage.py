@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from modeler.cli.options import PriorOptions
+from modeler.composition.options import PriorOptions
 from modeler.sequences import AbstractSequence
 from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.recipe import Recipe

@@ -10,9 +10,9 @@ from typing import Any, Final, Protocol, final
 import numpy as np
 
 from modeler import se3
-from modeler.cli import compose
-from modeler.cli.advice import comes_back
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.composition import compose
+from modeler.composition.compose import comes_back
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import TrueSurface, align_to_model, rotation_error_deg, surface_errors, true_motion
 from modeler.export.report import RunMeta, report_of
 from modeler.sequences import AbstractSequence

@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from modeler.cli.options import PriorOptions
+from modeler.composition.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.sequences.rendering.recipe import Recipe, TurnedOver
 from modeler.sequences.rendering.renderer import RenderedSequence

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, final
 
-from modeler.cli import compose
-from modeler.cli.advice import comes_back
-from modeler.cli.options import MethodOptions, ObjectOptions
+from modeler.composition import compose
+from modeler.composition.compose import comes_back
+from modeler.composition.options import MethodOptions, ObjectOptions
 from modeler.types import Step
 from studies.trust.plan import Half
 from studies.trust.stage import Recorded

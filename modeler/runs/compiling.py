@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from modeler.cli.console import say
 from modeler.system.processes import environment
 
 if TYPE_CHECKING:
@@ -30,8 +29,8 @@ _USED = (
 _USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
 
 
-def compile_kernels() -> None:
-    """Compile missing kernels with a progress message; they are kept for later commands, if they can be.
+def compile_kernels(say: Callable[[str], None]) -> None:
+    """Compile missing kernels and say how far that is; they are kept for later commands, if they can be.
 
     Does nothing if they are compiled. Failures here are ignored: kernels are then compiled, or reported, at first use.
     """
@@ -64,7 +63,7 @@ def compile_kernels() -> None:
 
     processes = [
         subprocess.Popen(
-            [sys.executable, "-c", f"from modeler.cli.compiling import work; work({job!r})"],
+            [sys.executable, "-c", f"from modeler.runs.compiling import work; work({job!r})"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

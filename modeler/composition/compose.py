@@ -13,8 +13,8 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, Literal
 
 from modeler import registration
-from modeler.cli.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.closure import Closer
+from modeler.composition.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.fusion import Fuser
 from modeler.kernels import gpu
 from modeler.pipeline import Modeler
@@ -29,6 +29,7 @@ from modeler.priors import (
     TablePrior,
     TurntablePrior,
     VelocityPrior,
+    turntable_in,
 )
 from modeler.priors.checks import ParameterError
 from modeler.registration.baselines import kiss
@@ -236,6 +237,21 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
             "frame to frame"
         )
     return name, "; ".join((*assumed, *sequence.notes))
+
+
+def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float) -> bool:
+    """Return whether the given rotations bring the object back to its first view, or nearly.
+
+    Args:
+        frames: the sequence, which may have the rotation from frame to frame.
+        prior: of the run, whose turntable takes precedence.
+        reach_deg: largest rotation across which views are registered.
+    """
+    table = turntable_in(prior)
+    step_deg = (frames.motion or {}).get("step_deg") if table is None else table.step_deg
+    if not isinstance(step_deg, int | float):
+        return False
+    return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
 def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) -> AbstractPrior:

@@ -1,19 +1,17 @@
-"""Inputs of commands: sequences with a progress bar, sequences that are still being written, and finished runs."""
+"""Finished runs, opened again: their sequences, components, views, edges and poses."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, final
+from typing import Any, TypeVar, final
 
-from modeler.cli import compose
-from modeler.cli.console import bar, say
-from modeler.cli.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.composition import compose
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import PoseGraph, solve
@@ -22,85 +20,16 @@ from modeler.segmentation import Scene
 from modeler.sequences import (
     AbstractSequence,
     CalibratedSequence,
-    Overrides,
     RefocusedSequence,
-    WatchLimits,
     open_sequence,
     read_focal_factor,
     read_noise,
-    watch,
 )
-from modeler.sequences.base import AbstractDerived
-from modeler.types import ACCEPTED, Array, Edge, Frame, InputError, RayImage, Solution
+from modeler.types import ACCEPTED, Array, Edge, InputError, RayImage, Solution
 from modeler.views import Sensor
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
 _ALIKE = 0.02  # largest relative change of an object's number of points between versions of a library
-
-
-@final
-@dataclass(frozen=True)
-class ObservedSequence(AbstractDerived):
-    """Another sequence, with a callback after each frame that is read."""
-
-    on_read: Callable[[], None]
-    """Called after each frame."""
-
-    def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`."""
-        frame = self.whole.frame(index)
-        self.on_read()
-        return frame
-
-
-class Watched(Protocol):
-    """From a sequence to the same sequence, watched."""
-
-    def __call__(self, sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
-        """Add a bar for a sequence, labelled with the operation on its frames."""
-        ...
-
-
-def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
-    """Yield the frames of a camera; a failure ends them with a line on stderr, as they cannot be read again."""
-    try:
-        yield from camera
-    except InputError as error:
-        say(f"{str(error).rstrip('.')}: continuing with the frames so far")
-
-
-@contextmanager
-def reading() -> Iterator[Watched]:
-    """Show a progress bar on stderr for each sequence as its frames are read; hidden if that is no terminal.
-
-    A sequence that is still being written is unchanged.
-    """
-    with bar() as progress:
-
-        def watched(sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
-            if sequence.live:
-                return sequence
-            task = progress.add_task(what, total=len(sequence))
-            return ObservedSequence(sequence, lambda: progress.advance(task))
-
-        yield watched
-
-
-def watched(path: Path, overrides: Overrides, idle_s: float) -> AbstractSequence:
-    """Return the sequence that another program is writing at a path, once it has begun.
-
-    Args:
-        path: where it writes.
-        overrides: values that take precedence over its files.
-        idle_s: the sequence is over after this many seconds without a new frame.
-
-    Raises:
-        InputError: if nothing readable comes.
-    """
-    if not 0.0 < idle_s < math.inf:
-        raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
-    say(f"waiting for frames in {path}")
-    return watch(path, overrides, WatchLimits(idle_s))
 
 
 @final

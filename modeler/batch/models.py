@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from modeler.cli.jobs import NOTES, read_note
+from modeler.batch.jobs import NOTES, read_note
 from modeler.export import RunFolder, mesh_of, poses_of, read_model, write_atomically
 from modeler.export.models_table import finite, model_columns, report_columns, write_table
 from modeler.types import Array, InputError
@@ -37,8 +37,8 @@ def record_of(run: Path) -> dict[str, Any]:
 
 def _errors(run: Path, report: dict[str, Any], centre_m: Array) -> dict[str, float]:
     """Return the pose errors of an object with that centre; empty without ground truth."""
-    from modeler.cli.inputs import parts_of
     from modeler.evaluation import trajectory_errors
+    from modeler.runs.reopening import parts_of
 
     truth: dict[int, Any] = {}
     for part in parts_of(run):

@@ -1,4 +1,4 @@
-"""`modeler export --for`: a model for a pose estimator, a simulator or a printer, with checks."""
+"""The model of a run for a pose estimator, a simulator or a printer: all files that the program needs, checked."""
 
 from __future__ import annotations
 
@@ -6,27 +6,24 @@ import contextlib
 import ctypes
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from modeler import export as files
 from modeler import se3
-from modeler.cli.console import say
-from modeler.cli.convert import finest_unit_mm
-from modeler.cli.export import Export, Purpose
-from modeler.cli.inputs import Reopened, reopened
-from modeler.cli.outputs import check_files, check_folder, run_inputs
 from modeler.export import bop, solids
 from modeler.export.checks import Checks, loaded, mesh_checks
 from modeler.export.mesh import TRIANGLES, Texture
 from modeler.export.placing import model_up
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
-from modeler.sequences import write_bop
+from modeler.runs.outputs import check_files, check_folder, run_inputs
+from modeler.runs.reopening import Reopened, reopened
+from modeler.sequences import finest_unit_mm, write_bop
 from modeler.types import Array, InputError, ObjectModel
 
 _FILES: Final = {"foundationpose": ".obj", "print": ".stl"}
@@ -35,63 +32,72 @@ _DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 
 _LEAST_FOOTPRINT: Final = 0.02  # of the box: a smaller footprint is not a flat bottom
 
 
+Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
+"""Programs for which there are presets."""
+
+
 @dataclass(frozen=True)
 class Preset:
     """One export for one program."""
 
-    options: Export
-    """The given options."""
+    run_folder: Path
+    """The run."""
+    out: Path
+    """File or folder to write."""
     purpose: Purpose
     """Which program it is for."""
+    say: Callable[[str], None]
+    """Receives what is worth knowing of the files, in words."""
+    overwrite: bool = False
+    """Replace existing files."""
+    triangles: int | None = None
+    """Simplify the mesh to so many; None: what the program and the detail need."""
+    texture_px: int = 2048
+    """Side of the texture."""
+    voxel_m: float | None = None
+    """Side of a voxel; None: as in the run."""
+    density_kg_m3: float | None = None
+    """Density of the solid; None: that of water."""
+    mass_kg: float | None = None
+    """Mass, instead of a density."""
+    sequences: tuple[Path, ...] = ()
+    """Where the sequences of the run are now; none: where they were."""
 
-    def run(self) -> int:
-        """Write the files, read them back, and report the checks; 3 if one fails.
+    def write(self) -> Checks:
+        """Write the files, read them back, and return the checks.
 
         Raises:
-            InputError: if options exclude each other, or something cannot be read or written.
+            InputError: if something cannot be read or written.
         """
-        options = self.options
-        self._refuse()
-        inputs = run_inputs([options.run_folder], options.moved.sequence)
+        inputs = run_inputs([self.run_folder], self.sequences)
         if self.purpose in _FILES:
-            if options.out.suffix.lower() != _FILES[self.purpose]:
+            if self.out.suffix.lower() != _FILES[self.purpose]:
                 raise InputError(
-                    f"{options.out}: --for {self.purpose} writes {_FILES[self.purpose]}; give --out such a suffix"
+                    f"{self.out}: --for {self.purpose} writes {_FILES[self.purpose]}; give --out such a suffix"
                 )
         else:
-            check_folder(options.out, inputs)
-            if os.path.lexists(options.out) and not options.out.is_dir():
-                raise InputError(f"{options.out}: is not a folder; choose another --out")
-        report = files.RunFolder(options.run_folder).result()
+            check_folder(self.out, inputs)
+            if os.path.lexists(self.out) and not self.out.is_dir():
+                raise InputError(f"{self.out}: is not a folder; choose another --out")
+        report = files.RunFolder(self.run_folder).result()
         if not report.get("poses"):
-            raise InputError(f"{options.run_folder}: no frame of this run was accepted; report.json says why")
-        check_files(self._outs(textured=True), inputs, overwrite=options.overwrite)
-        made = getattr(self, f"_{self.purpose}")()
-        say(made.words)
-        return 3 if made.failed else 0
-
-    def _refuse(self) -> None:
-        """Reject options that the preset decides.
-
-        Raises:
-            InputError: if one is given.
-        """
-        given = [
-            name for name in ("origin", "up", "watertight", "texture", "bop", "tint") if getattr(self.options, name)
-        ]
-        if given:
-            raise InputError(f"--for {self.purpose} decides on --{given[0]}; leave it out")
-        of_bodies = [
-            name
-            for name, value in (("density-kg-m3", self.options.density_kg_m3), ("mass-kg", self.options.mass_kg))
-            if value is not None
-        ]
-        if of_bodies and self.purpose not in ("mujoco", "urdf"):
-            raise InputError(f"--{of_bodies[0]} goes with --for mujoco and --for urdf alone")
+            raise InputError(f"{self.run_folder}: no frame of this run was accepted; report.json says why")
+        check_files(self._outs(textured=True), inputs, overwrite=self.overwrite)
+        match self.purpose:
+            case "foundationpose":
+                return self._foundationpose()
+            case "bop":
+                return self._bop()
+            case "mujoco":
+                return self._mujoco()
+            case "urdf":
+                return self._urdf()
+            case "print":
+                return self._print()
 
     def _outs(self, *, textured: bool) -> tuple[Path, ...]:
         """Return the files to write, except convex parts and scenes, whose number is unknown before."""
-        out = self.options.out
+        out = self.out
         if self.purpose == "bop":
             return (self._bop_model, self._bop_model.with_name(bop.MODELS_INFO))
         if self.purpose in _FILES:
@@ -103,12 +109,12 @@ class Preset:
 
     @cached_property
     def _reopened(self) -> Reopened:
-        return reopened(self.options.run_folder, self.options.moved.sequence)
+        return reopened(self.run_folder, self.sequences)
 
     @cached_property
     def _volume(self) -> FusionVolume:
         run = self._reopened
-        return run.volume(Fuser(voxel_m=self.options.voxel_m or run.report["settings"].get("voxel_m")))
+        return run.volume(Fuser(voxel_m=self.voxel_m or run.report["settings"].get("voxel_m")))
 
     def _model(self, *, watertight: bool) -> ObjectModel:
         """Return the mesh in the object frame.
@@ -118,20 +124,20 @@ class Preset:
         """
         model = self._volume.model(watertight=watertight)
         if not len(model.triangles):
-            raise InputError(f"{self.options.run_folder}: its views give no surface; more of them are needed")
+            raise InputError(f"{self.run_folder}: its views give no surface; more of them are needed")
         return model
 
     def _coloured(self, model: ObjectModel) -> tuple[ObjectModel, Texture | None]:
         """Return the mesh, simplified and without degenerate triangles, with its texture where frames have colour."""
         coloured = self._volume.views.coloured
-        count = self.options.triangles or (TRIANGLES if coloured else _PLAIN_TRIANGLES)
+        count = self.triangles or (TRIANGLES if coloured else _PLAIN_TRIANGLES)
         model = solids.without_degenerate(files.simplified(model, count))
         if not coloured:
             return model, None
-        return files.textured(model, self._volume.texture_colours, self.options.texture_px)
+        return files.textured(model, self._volume.texture_colours, self.texture_px)
 
     def _foundationpose(self) -> Checks:
-        out = self.options.out
+        out = self.out
         model, texture = self._coloured(self._model(watertight=False))
         place = files.placement(model, self._reopened.report, "bbox", "z")
         files.write_mesh(place.placed(model), out, texture, axes=place.axes)
@@ -150,10 +156,10 @@ class Preset:
         )
 
     def _print(self) -> Checks:
-        out = self.options.out
+        out = self.out
         model = self._model(watertight=True)
-        if self.options.triangles is not None:
-            model = files.simplified(model, self.options.triangles)
+        if self.triangles is not None:
+            model = files.simplified(model, self.triangles)
         place = files.placement(model, self._reopened.report, "base", "z")
         base_known = place.up_from == "support"
         flat = solids.with_flat_bottom(place.placed(model), self._volume.grid.voxel_m if base_known else None)
@@ -203,17 +209,17 @@ class Preset:
         """Write the visual mesh and the convex parts, and return them with mass and inertia."""
         whole = self._model(watertight=True)
         place = files.placement(whole, self._reopened.report, "base", "z")
-        density = self.options.density_kg_m3 or _DENSITY_KG_M3
-        body = solids.body_of(place.placed(whole), density_kg_m3=density, mass_kg=self.options.mass_kg)
+        density = self.density_kg_m3 or _DENSITY_KG_M3
+        body = solids.body_of(place.placed(whole), density_kg_m3=density, mass_kg=self.mass_kg)
         parts = solids.convex_parts(place.placed(whole))
         model, texture = self._coloured(whole)
-        of = solids.PhysicsFiles(self.options.out, texture is not None)
+        of = solids.PhysicsFiles(self.out, texture is not None)
         files.write_mesh(place.placed(model), of.visual, texture, axes=place.axes)
         place.write(of.visual)
         solids.write_parts(of, parts)
         self._report(place)
-        source = "as given" if self.options.mass_kg is not None else f"at {density:g} kg/m³"
-        say(f"{body.mass_kg:.3g} kg {source}; friction {solids.FRICTION[0]:g}, a default: neither is measured")
+        source = "as given" if self.mass_kg is not None else f"at {density:g} kg/m³"
+        self.say(f"{body.mass_kg:.3g} kg {source}; friction {solids.FRICTION[0]:g}, a default: neither is measured")
         return of, body, parts
 
     def _solid_checks(self, of: solids.PhysicsFiles, body: solids.Body, parts: solids.ConvexParts) -> Checks:
@@ -228,10 +234,10 @@ class Preset:
 
     @property
     def _bop_model(self) -> Path:
-        return self.options.out / "models" / "obj_000001.ply"
+        return self.out / "models" / "obj_000001.ply"
 
     def _bop(self) -> Checks:
-        run, out = self._reopened, self.options.out
+        run, out = self._reopened, self.out
         scenes = {
             f"obj_000001_{side}": {frame: run.views[frame] for frame in frames}
             for side, frames in self._sides().items()
@@ -241,15 +247,15 @@ class Preset:
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
                 raise InputError(f"{folder}: exists already; remove it or give another --out")
         model = self._model(watertight=False)
-        if self.options.triangles is not None:
-            model = files.simplified(model, self.options.triangles)
+        if self.triangles is not None:
+            model = files.simplified(model, self.triangles)
         model = solids.without_degenerate(model)
         place = files.placement(model, run.report, "bbox", "z")
         found = SymmetryFinder().find_in(model, model_up(run.report)[0])
         entries = _symmetry_entries(found, place.object_from_mesh)
         files.write_bop(model, self._bop_model, place, entries)
         self._report(place)
-        say(found.words)
+        self.say(found.words)
         placed, count = place.placed(model), 0
         for name, views in scenes.items():
             poses = {k: se3.inverse(run.solution.trajectory[k]) @ place.object_from_mesh for k in views}
@@ -281,7 +287,7 @@ class Preset:
         from modeler.sequences import open_sequence
 
         for name, views in scenes.items():
-            sequence = open_sequence(self.options.out / "onboarding_static" / name)
+            sequence = open_sequence(self.out / "onboarding_static" / name)
             truth = sequence.truth() or {}
             if {*sequence.indices} != {*views} or {*truth} != {*views}:
                 return False
@@ -290,7 +296,7 @@ class Preset:
         return True
 
     def _report(self, place: files.Placement) -> None:
-        say(f"{self.options.out}: {place.words}")
+        self.say(f"{self.out}: {place.words}")
 
 
 def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, Any]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import AutoPrior, GeneralPrior, TablePrior, TurntablePrior, turntable_in
-from modeler.sequences import AbstractSequence
 from modeler.types import AbstractPrior, Failed, Outcome, Posterior, Reason, advice
 from modeler.verdict.evidence import MAX_UNSURE
 
@@ -58,21 +57,6 @@ def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors
         return advice(reason)
     failed = next((posterior for posterior in posteriors if posterior.outcome is reason.outcome), None)
     return outcome_advice(reason.outcome, prior, failed)
-
-
-def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float) -> bool:
-    """Return whether the given rotations bring the object back to its first view, or nearly.
-
-    Args:
-        frames: the sequence, which may have the rotation from frame to frame.
-        prior: of the run, whose turntable takes precedence.
-        reach_deg: largest rotation across which views are registered.
-    """
-    table = turntable_in(prior)
-    step_deg = (frames.motion or {}).get("step_deg") if table is None else table.step_deg
-    if not isinstance(step_deg, int | float):
-        return False
-    return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
 def sign_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:

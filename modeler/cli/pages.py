@@ -1,0 +1,153 @@
+"""`modeler view`, `modeler report` and `modeler gallery`: the recording of a run, its page, and the page of many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from modeler.cli.console import bar, say
+from modeler.cli.options import MovedOptions
+from modeler.composition.options import default
+
+if TYPE_CHECKING:
+    from modeler.types import Array
+
+
+@dataclass(frozen=True)
+class View:
+    """Open the recording of a run in the Rerun viewer."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Run folder of `modeler build`."""
+    web: bool = False
+    """Serve the viewer in the browser, on 127.0.0.1 only, until Ctrl-C."""
+
+    def run(self) -> int:
+        """Open the viewer; in the browser, wait until the user is done."""
+        from modeler.viz import viewer
+
+        opened = viewer.view(self.run_folder, web=self.web)
+        if self.web:
+            say(f"open {opened.address} in a browser; Ctrl-C ends it")
+            opened.wait()
+        return 0
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write one HTML page about a run: model, trajectory, uncertainty, errors, pairs, settings. It needs no network.
+
+    Errors and coverage are shown if the sequence is available and has ground truth.
+    """
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Run folder of `modeler build`."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("RUN/report.html")] = None
+    """Page to write."""
+    overwrite: bool = False
+    """Replace an existing page."""
+    moved: MovedOptions = field(default_factory=MovedOptions)
+
+    def run(self) -> int:
+        """Write the page."""
+        from modeler.export import RunFolder
+        from modeler.export.run_folder import PAGE
+        from modeler.runs.outputs import check_files, run_inputs
+        from modeler.types import InputError
+        from modeler.viz.report import write_page
+
+        out = self.run_folder / PAGE if self.out is None else self.out
+        inputs = run_inputs([self.run_folder], self.moved.sequence)
+        check_files([out], inputs[1:] if self.out is None else inputs, overwrite=self.overwrite)
+        RunFolder(self.run_folder).result()  # refuses folders without a finished run
+        try:
+            truth = _truth(self.run_folder, self.moved.sequence)
+        except InputError:
+            if self.moved.sequence:
+                raise
+            truth = None
+        write_page(self.run_folder, out, truth)
+        say(f"open {out} in a browser")
+        return 0
+
+
+def _truth(run: Path, sequences: tuple[Path, ...]) -> Mapping[int, Array] | None:
+    """Return the true camera_from_model by frame number; None if unknown.
+
+    Raises:
+        InputError: if a sequence is not to be found, or is another than the run was made from.
+    """
+    from modeler.runs.reopening import parts_of
+
+    poses: dict[int, Array] = {}
+    for part in parts_of(run, sequences):
+        truth = part.truth()
+        if truth is not None:
+            part.check()
+            poses |= truth
+    return poses or None
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Write one HTML page about the models in a folder: pictures and values, to sort and filter. It needs no network.
+
+    Also updates the list DIR/models.parquet.
+    """
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
+    """Folder of run folders, from `modeler batch`."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html"), default("DIR/gallery.html")] = None
+    """Page to write."""
+    overwrite: bool = False
+    """Replace an existing page."""
+
+    def run(self) -> int:
+        """Write the page.
+
+        Raises:
+            InputError: if the folder holds no run, or the page cannot be written.
+        """
+        import os
+        from urllib.parse import quote
+
+        from modeler.batch.jobs import NOTES
+        from modeler.batch.models import TABLE, models_in, thumbnail_of
+        from modeler.export.models_table import blank, write_table
+        from modeler.runs.outputs import check_files
+        from modeler.system.regular_files import read_regular
+        from modeler.types import InputError
+        from modeler.viz.report.gallery import write_gallery
+
+        out = self.folder / "gallery.html" if self.out is None else self.out
+        check_files([out], [], overwrite=self.overwrite)
+        rows = models_in(self.folder)
+        if not rows:
+            raise InputError(f"{self.folder}: holds no run folder; give the --out of modeler batch")
+        write_table(self.folder / TABLE, rows)
+        pictures, links = {}, {}
+        with bar() as progress:
+            for row in progress.track(rows):
+                name = row["name"]
+                if row.get("triangles"):
+                    picture = self.folder / NOTES / f"{name}.jpg"
+                    if not _newer(picture, self.folder / name / "model.ply"):
+                        thumbnail_of(self.folder / name, picture)
+                    if picture.exists():  # not so where the model was removed
+                        pictures[name] = read_regular(picture)
+                pages = [self.folder / name / page for page in ("report.html", "report.json")]
+                page = next((page for page in pages if page.exists()), None)
+                if page is not None:
+                    links[name] = quote(Path(os.path.relpath(page, out.parent)).as_posix())
+        write_gallery(out, self.folder.absolute().name, [blank() | row for row in rows], pictures, links)
+        say(f"open {out} in a browser")
+        return 0
+
+
+def _newer(picture: Path, model: Path) -> bool:
+    """Return whether the picture of a model is up to date, or the model was removed."""
+    return picture.exists() and (not model.exists() or picture.stat().st_mtime_ns >= model.stat().st_mtime_ns)

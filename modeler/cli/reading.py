@@ -1,0 +1,80 @@
+"""Sequences as commands read them: with a progress bar, from a camera, or while they are still being written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, final
+
+from modeler.cli.console import bar, say
+from modeler.sequences import AbstractSequence, Overrides, WatchLimits, watch
+from modeler.sequences.base import AbstractDerived
+from modeler.types import Frame, InputError
+
+
+@final
+@dataclass(frozen=True)
+class ObservedSequence(AbstractDerived):
+    """Another sequence, with a callback after each frame that is read."""
+
+    on_read: Callable[[], None]
+    """Called after each frame."""
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`."""
+        frame = self.whole.frame(index)
+        self.on_read()
+        return frame
+
+
+class Watched(Protocol):
+    """From a sequence to the same sequence, watched."""
+
+    def __call__(self, sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
+        """Add a bar for a sequence, labelled with the operation on its frames."""
+        ...
+
+
+def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
+    """Yield the frames of a camera; a failure ends them with a line on stderr, as they cannot be read again."""
+    try:
+        yield from camera
+    except InputError as error:
+        say(f"{str(error).rstrip('.')}: continuing with the frames so far")
+
+
+@contextmanager
+def reading() -> Iterator[Watched]:
+    """Show a progress bar on stderr for each sequence as its frames are read; hidden if that is no terminal.
+
+    A sequence that is still being written is unchanged.
+    """
+    with bar() as progress:
+
+        def watched(sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
+            if sequence.live:
+                return sequence
+            task = progress.add_task(what, total=len(sequence))
+            return ObservedSequence(sequence, lambda: progress.advance(task))
+
+        yield watched
+
+
+def watched(path: Path, overrides: Overrides, idle_s: float) -> AbstractSequence:
+    """Return the sequence that another program is writing at a path, once it has begun.
+
+    Args:
+        path: where it writes.
+        overrides: values that take precedence over its files.
+        idle_s: the sequence is over after this many seconds without a new frame.
+
+    Raises:
+        InputError: if nothing readable comes.
+    """
+    if not 0.0 < idle_s < math.inf:
+        raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
+    say(f"waiting for frames in {path}")
+    return watch(path, overrides, WatchLimits(idle_s))

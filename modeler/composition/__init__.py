@@ -1,0 +1,1 @@
+"""From names, parameters and the metadata of a sequence to components."""

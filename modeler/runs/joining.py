@@ -1,0 +1,173 @@
+"""Two runs of one object to one model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from modeler.export import RunFolder, RunMeta, alone
+from modeler.fusion import Fuser, conditional_covariances
+from modeler.graph import PoseGraph, solve
+from modeler.pipeline.joining import Alignment, Joiner, Segment
+from modeler.pipeline.pairs import Registrations
+from modeler.registration import VisibilityRegistrar
+from modeler.runs.reopening import Part, Reopened, renumbered, reopened
+from modeler.types import FrameRecord, InputError, Outcome, RayImage, Segmentation, Solution, Step, Verdict
+from modeler.verdict import judged
+from modeler.viz.stream import open_stream
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Result of joining two runs."""
+
+    alignments: Sequence[Alignment]
+    """Of their models, the likeliest first; that one was used."""
+    report: Mapping[str, Any]
+    """As in report.json."""
+    verdict: Verdict
+    """Whether the model can be trusted."""
+
+
+def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrite: bool) -> Joined:
+    """Join two runs of the same object in different postures into one run folder.
+
+    Args:
+        run_a: run folder whose object frame is kept.
+        run_b: run folder, whose frame numbers continue those of the other.
+        out: run folder to create.
+        pairs: number of pairs of views, one of each run, to register.
+        seed: of every random number.
+        overwrite: whether the results of an earlier run in the folder are replaced.
+
+    Raises:
+        InputError: if a run cannot be read, or no pair of their views can be registered.
+    """
+    began_s = time.perf_counter()
+    first, second = reopened(run_a), reopened(run_b)
+    offset = max(record["id"] for record in first.report["frames"]) + 1
+    second = _shifted(second, offset)
+    joiner = Joiner(Registrations(VisibilityRegistrar(), seed), pairs=pairs)
+    parts = [Segment(run.views, run.solution, run.edges) for run in (first, second)]
+    alignments = joiner.join(*parts)
+    if not alignments:
+        raise InputError("the models cannot be aligned; build both runs from more views")
+    if not alignments[0].accepted:
+        raise InputError(
+            f"{run_a} and {run_b}: no alignment of the models fits their views; check "
+            "that they show the same object and share enough surface"
+        )
+    edges = (*first.edges, *second.edges, *alignments[0].edges)
+    graph = PoseGraph(edges=edges, first=min(first.solution.trajectory))
+    guess = dict(first.solution.trajectory) | {
+        frame: alignments[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()
+    }
+    meta = RunMeta(
+        sequence=f"{first.report['sequence']} + {second.report['sequence']}",
+        seed=seed,
+        prior="none",
+        settings={"joined": [str(run.absolute()) for run in (run_a, run_b)], "offset": offset, "pairs": pairs},
+        camera=_least_known([*first.parts, *second.parts]),
+    )
+    with alone(out):
+        folder = RunFolder.open(out, overwrite=overwrite)
+        report, verdict = _written(folder, (first, second), graph, solve(graph, guess), meta, began_s=began_s)
+        folder.finish()
+    return Joined(alignments, report, verdict)
+
+
+def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
+    """Return the estimate of the camera with the most uncertain depth scale; None if all are as given."""
+    cameras = [camera for part in parts if (camera := part.report.get("camera")) is not None]
+    return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
+
+
+def _shifted(run: Reopened, offset: int) -> Reopened:
+    """Return a run with frame numbers from `offset` on."""
+    edges = tuple(
+        replace(
+            edge,
+            posterior=replace(edge.posterior, source=edge.source + offset, target=edge.target + offset),
+        )
+        for edge in run.edges
+    )
+    trajectory, covariances, odometry = (
+        {frame + offset: value for frame, value in mapping.items()}
+        for mapping in (run.solution.trajectory, run.solution.covariances, run.solution.odometry)
+    )
+    before = run.solution.relative_covariance
+    solution = replace(
+        run.solution,
+        trajectory=trajectory,
+        covariances=covariances,
+        odometry=odometry,
+        relative_covariance=lambda target, source: before(target - offset, source - offset),
+    )
+    views = {frame + offset: renumbered(view, offset) for frame, view in run.views.items()}
+    report = dict(run.report) | {"frames": [r | {"id": r["id"] + offset} for r in run.report["frames"]]}
+    return replace(run, report=report, views=views, edges=edges, solution=solution)
+
+
+def _written(
+    folder: RunFolder,
+    parts: tuple[Reopened, Reopened],
+    graph: PoseGraph,
+    solution: Solution,
+    meta: RunMeta,
+    *,
+    began_s: float,
+) -> tuple[Mapping[str, Any], Verdict]:
+    """Fuse the frames of both parts, write the run folder with its recording and return its report and verdict."""
+    views = dict(parts[0].views) | dict(parts[1].views)
+    model = Fuser().fuse(views, solution.trajectory, conditional_covariances(solution, graph.edges))
+    names = [field.name for field in fields(FrameRecord)]
+    records = [
+        FrameRecord(**{name: record[name] for name in names if name in record})
+        for part in parts
+        for record in part.report["frames"]
+    ]
+    depth_scale_sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
+    joining = tuple(edge for edge in graph.edges if edge.source in parts[1].views and edge.target in parts[0].views)
+    best = max((edge.posterior for edge in joining if edge.accepted), key=lambda posterior: posterior.overlap)
+    first, root = min(views), {min(views): np.eye(4)}
+    begun = _step(views[first], solution=Solution(root, odometry=root), views={first: views[first]})
+    step = replace(
+        _step(views[best.source], solution=solution, views=views),
+        posteriors=(best,),
+        edges=joining,
+        make_model=lambda: model,
+        edges_so_far=graph.edges,
+        frames_so_far=tuple(sorted(records, key=lambda record: record.id)),
+        last=True,
+    )
+    verdict = judged(step, depth_scale_sigma=depth_scale_sigma)
+    step = replace(step, verdict=verdict)
+    facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
+    stream = open_stream(" + ".join(part.name for part in parts), save=folder.path / "recording.rrd", facts=facts)
+    try:
+        report = folder.write(step, replace(meta, seconds={"total": time.perf_counter() - began_s}))
+        stream(begun)
+        stream(step)
+    finally:
+        stream.close()
+    return report, verdict
+
+
+def _step(view: RayImage, *, solution: Solution, views: Mapping[int, RayImage]) -> Step:
+    """Return a step of one view that is part of the model."""
+    mask = view.frame.mask if view.frame.mask is not None else np.isfinite(view.frame.depth_m)
+    return Step(
+        frame=view.frame,
+        segmentation=Segmentation(mask, view.plane, Outcome.CONVERGED),
+        view=view,
+        posteriors=(),
+        edges=(),
+        left_out=None,
+        solution=solution,
+        views=views,
+    )
