@@ -17,14 +17,12 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.sequences.base import AbstractSequence
+from modeler.sequences.depth_files import check_same_size, metres, no_depth, read_depth
 from modeler.sequences.image_files import (
-    check_same_size,
+    COLOUR_SUFFIXES,
     check_size,
-    metres,
-    no_depth,
     object_and_occluder,
     read_colour,
-    read_depth,
     read_labels,
     read_mask,
     write_image,
@@ -211,13 +209,12 @@ class BopSequence(AbstractRecording):
             raise InputError(f"{self.path}: no such folder; give a BOP scene folder with depth/ and scene_camera.json.")
         paths = _numbered(self.path, "depth", (".png", ".tif", ".tiff"))
         if not paths:
-            raise no_depth(self.path / "depth", "000000.png, 000001.png, ...")
+            raise no_depth(self.path / "depth", "000000.png, 000001.png, ...", "16-bit PNG and TIFF")
         return dict(sorted(paths.items()))
 
     @cached_property
     def _colour_paths(self) -> dict[int, Path]:
-        kinds = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-        return _numbered(self.path, "rgb", kinds) or _numbered(self.path, "gray", kinds)
+        return _numbered(self.path, "rgb", COLOUR_SUFFIXES) or _numbered(self.path, "gray", COLOUR_SUFFIXES)
 
     @cached_property
     def _intrinsics(self) -> dict[int, tuple[tuple[float, float, float, float], float]]:

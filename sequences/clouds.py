@@ -14,8 +14,8 @@ from typing import BinaryIO, final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.sequences.file_names import frame_numbers
 from modeler.sequences.image_files import MAX_PIXELS
-from modeler.sequences.image_folders import frame_numbers
 from modeler.sequences.input_files import input_errors, list_images
 from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
 from modeler.sequences.recording import AbstractRecording

@@ -1,4 +1,4 @@
-"""Depth, colour and mask images on disk."""
+"""Colour and mask images on disk, and the decoding of images."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from modeler.sequences.input_files import entries
 from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import BoolArray, InputError
 
 MAX_PIXELS = 50_000_000
 """Larger images are refused before they are decoded: no depth camera makes them, decompression bombs do."""
 
-_KINDS = {"L": "an 8-bit image", "P": "an 8-bit image", "RGB": "a colour image", "RGBA": "a colour image"}
+COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 
 
 @final
@@ -42,8 +43,12 @@ class EmbeddedImage:
         return self.where
 
 
-def _open(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Image:
-    """Return an image fully decoded."""
+def open_image(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Image:
+    """Return an image fully decoded.
+
+    Raises:
+        InputError: if it is missing, broken, too large or of none of the formats.
+    """
     wanted = " or ".join(formats)
     try:
         with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
@@ -120,39 +125,12 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")
-            with Image.open(stream, formats=("PNG", "TIFF", "JPEG")) as image:
+            with Image.open(stream, formats=_FORMATS) as image:
                 return image.size
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"{path}: is not a readable image ({type(error).__name__}); replace it.") from None
-
-
-def no_depth(folder: Path, wanted: str) -> InputError:
-    """Return the error for a folder without depth images that can be read; `wanted` is what should be there."""
-    others = sorted({path.suffix.lower() for path in entries(folder) if path.suffix and not path.name.startswith(".")})
-    if others:
-        return InputError(
-            f"{folder}: holds no depth image that can be read, but files {', '.join(others[:3])}; 16-bit PNG and TIFF "
-            "are read, convert them."
-        )
-    return InputError(f"{folder}: holds no depth image; put {wanted} there.")
-
-
-def read_depth(path: Path | EmbeddedImage) -> npt.NDArray[np.uint16]:
-    """Return a 16-bit PNG or TIFF (h, w) in raw units; 0 = no measurement.
-
-    Raises:
-        InputError: if the file is missing, broken, too large or not 16-bit greyscale.
-    """
-    image = _open(path, ("PNG", "TIFF"))
-    if image.mode not in ("I;16", "I;16B", "I"):
-        kind = _KINDS.get(image.mode, f"of mode {image.mode}")
-        raise InputError(f"{path}: is {kind}; depth must be a 16-bit greyscale PNG or TIFF image.")
-    pixels = np.asarray(image)
-    if image.mode == "I" and (pixels.min(initial=0) < 0 or pixels.max(initial=0) > np.iinfo(np.uint16).max):
-        raise InputError(f"{path}: holds values beyond 16 bits; depth must be a 16-bit greyscale PNG or TIFF image.")
-    return pixels.astype(np.uint16)
 
 
 def read_mask(path: Path) -> BoolArray:
@@ -171,13 +149,50 @@ OCCLUDED = 128
 def read_labels(path: Path) -> npt.NDArray[np.uint8]:
     """Return the values of a mask (h, w): 0 or `OCCLUDED` of 8-bit images of those values, else 255.
 
+    In images of few values, labels, all but 0 are object; of the many between black and white that soft edges, veils
+    and JPEG make, those from the middle of the range on.
+
     Raises:
         InputError: if the file is missing, broken or too large.
     """
-    image = _open(path, ("PNG",))
-    pixels = np.asarray(image if image.mode in ("1", "L", "I;16", "I") else image.convert("L"))
-    occluded = (pixels == OCCLUDED) & (image.mode == "L")  # a palette numbers things
+    pixels, is_grey = _mask_pixels(path)
+    if is_soft(pixels):
+        return np.where(pixels >= np.ceil(pixels.max() / 2), 255, 0).astype(np.uint8)
+    occluded = (pixels == OCCLUDED) & is_grey  # a palette numbers things
     return np.where(occluded, OCCLUDED, np.where(pixels != 0, 255, 0)).astype(np.uint8)
+
+
+def _mask_pixels(path: Path) -> tuple[npt.NDArray[np.generic], bool]:
+    """Return the values of a mask (h, w), of colour the brightest channel, and whether it is stored as 8-bit grey."""
+    image = open_image(path, _FORMATS)
+    if image.mode in ("LA", "RGBA", "PA"):
+        alpha = np.asarray(image.getchannel("A"))
+        if alpha.min() < 255:  # the object is cut out
+            return alpha, False
+    if image.mode in ("1", "L", "P", "I;16", "I"):
+        return np.asarray(image if image.mode != "P" else image.convert("L")), image.mode == "L"
+    return np.asarray(image.convert("RGB")).max(axis=2), False
+
+
+_WHITE, _VEIL, _FEW_LABELS = 192, 16, 8
+
+
+def is_soft(pixels: npt.NDArray[np.generic]) -> bool:
+    """Return whether a mask (h, w) is graded between black and white, instead of a few labels."""
+    if pixels.dtype != np.uint8 or pixels.max(initial=0) < _WHITE:
+        return False
+    values = np.unique(pixels)
+    between = values[(values > 0) & (values < values[-1]) & (values != OCCLUDED)]
+    return len(between) > _FEW_LABELS or values[0] > 0 or bool(between.size and between[0] <= _VEIL)
+
+
+def graded(path: Path) -> bool:
+    """Return whether the mask in a file is graded between black and white.
+
+    Raises:
+        InputError: if the file is missing, broken or too large.
+    """
+    return is_soft(_mask_pixels(path)[0])
 
 
 def object_and_occluder(
@@ -196,12 +211,12 @@ def object_and_occluder(
 
 
 def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:
-    """Return a PNG, JPEG or TIFF, in colour or grey, as RGB (h, w, 3).
+    """Return an image, in colour or grey, as RGB (h, w, 3).
 
     Raises:
         InputError: if the file is missing, broken or too large.
     """
-    image = _open(path, ("PNG", "JPEG", "TIFF"))
+    image = open_image(path, _FORMATS)
     if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
         grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
         return np.repeat(grey[:, :, None], 3, axis=2)
@@ -215,11 +230,6 @@ def write_image(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint1
         image.save(path, quality=85, optimize=True)
     else:
         image.save(path, compress_level=9, optimize=True)
-
-
-def metres(raw: npt.NDArray[np.uint16], scale_mm: float) -> npt.NDArray[np.float32]:
-    """Return depth (h, w) in m of raw units; 0 becomes NaN."""
-    return np.where(raw == 0, np.float32(np.nan), (raw * (scale_mm / 1000.0)).astype(np.float32))
 
 
 def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> None:
@@ -251,20 +261,3 @@ def resize_to_depth(path: Path, colour: npt.NDArray[np.uint8], depth: tuple[int,
 def is_finer(colour: tuple[int, ...], depth: tuple[int, ...]) -> bool:
     """Return whether colour has more pixels than depth, each (width, height), and the same shape to the pixel."""
     return colour[0] > depth[0] and abs(colour[0] * depth[1] / depth[0] - colour[1]) < 1.0
-
-
-def check_same_size(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
-    """Refuse a depth image of another size than one with the same intrinsics.
-
-    Args:
-        path: the depth image.
-        size: its (h, w).
-        alike: the other.
-        said: source of the common intrinsics, and advice.
-
-    Raises:
-        InputError: if it is.
-    """
-    width, height = image_size(alike)
-    if size != (height, width):
-        raise InputError(f"{path}: is {size[1]} x {size[0]} pixels where {alike.name} is {width} x {height}, {said}.")

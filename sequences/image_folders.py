@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import final
 
@@ -13,16 +13,25 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.sequences.image_files import (
+from modeler.sequences.depth_files import (
+    SUFFIXES,
     check_same_size,
-    check_size,
-    image_size,
-    is_finer,
+    depth_size,
+    float_unit_mm,
     metres,
     no_depth,
+    read_depth,
+)
+from modeler.sequences.file_names import frame_numbers, partners, role_of, stamps_s
+from modeler.sequences.image_files import (
+    COLOUR_SUFFIXES,
+    MASK_SUFFIXES,
+    check_size,
+    graded,
+    image_size,
+    is_finer,
     object_and_occluder,
     read_colour,
-    read_depth,
     read_labels,
     read_mask,
     resize_to_depth,
@@ -37,6 +46,7 @@ from modeler.sequences.input_files import (
     read_text,
 )
 from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, find_intrinsics
+from modeler.sequences.lens import Lens
 from modeler.sequences.recording import AbstractRecording, paired
 from modeler.types import Array, Camera, Frame, InputError
 
@@ -49,13 +59,17 @@ class FrameFiles:
     time_s: float
     """Time of capture in s."""
     depth: Path
-    """16-bit image."""
+    """Image of depth."""
     colour: Path | None = None
     """Colour aligned to depth, in its size or finer."""
     mask: Path | None = None
     """Non-zero = object, `OCCLUDED` = something before it."""
     occluder: Path | None = None
     """Non-zero = something before the object."""
+    confidence: Path | None = None
+    """0 = depth that its camera does not trust, and that is left out."""
+    intrinsics: Intrinsics | None = None
+    """fx, fy, cx, cy in px of this frame; None: those of the sequence."""
 
 
 @final
@@ -65,8 +79,8 @@ class ImageFolderSequence(AbstractRecording):
 
     files: Mapping[int, FrameFiles]
     """By frame number, ascending."""
-    intrinsics: Intrinsics
-    """fx, fy, cx, cy in px."""
+    camera: CameraFacts
+    """The camera."""
     depth_scale_mm: float
     """Millimetres per unit of depth."""
     what: str
@@ -97,8 +111,9 @@ class ImageFolderSequence(AbstractRecording):
         if files is None:
             raise self.absent(index)
         raw = read_depth(files.depth)
-        first = self.files[self.indices[0]].depth
-        check_same_size(files.depth, raw.shape, first, "and one camera took them all; convert each size by itself")
+        check_same_size(
+            files.depth, raw.shape, self._first, "and one camera took them all; convert each size by itself"
+        )
         labels = None if files.mask is None else read_labels(files.mask)
         occluder = None if files.occluder is None else read_mask(files.occluder)
         colour = None if files.colour is None else read_colour(files.colour)
@@ -107,9 +122,29 @@ class ImageFolderSequence(AbstractRecording):
                 check_size(path, image.shape, raw.shape)
         if files.colour is not None and colour is not None:
             colour = resize_to_depth(files.colour, colour, raw.shape)
-        camera = Camera(raw.shape[1], raw.shape[0], *self.intrinsics)
+        depth_m = metres(raw, self.depth_scale_mm)
+        if files.confidence is not None:
+            trusted = read_mask(files.confidence)
+            check_size(files.confidence, trusted.shape, raw.shape)
+            depth_m[~trusted] = np.nan
         mask, occluder = (None, occluder) if labels is None else object_and_occluder(labels, occluder)
-        return Frame(index, files.time_s, metres(raw, self.depth_scale_mm), camera, mask, colour, occluder)
+        lens, camera = self._lens, self._lens.camera
+        if files.intrinsics is not None:
+            camera = Camera(camera.width, camera.height, *files.intrinsics)
+        elif lens.is_distorted:
+            depth_m = lens.undistort(depth_m, float("nan"))
+            mask, occluder, colour = (
+                None if image is None else lens.undistort(image) for image in (mask, occluder, colour)
+            )
+        return Frame(index, files.time_s, depth_m, camera, mask, colour, occluder)
+
+    @property
+    def _first(self) -> Path:
+        return self.files[self.indices[0]].depth
+
+    @cached_property
+    def _lens(self) -> Lens:
+        return self.camera.lens(depth_size(self._first))
 
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known."""
@@ -128,14 +163,17 @@ class ImageFolderSequence(AbstractRecording):
     @property
     def notes(self) -> tuple[str, ...]:
         """Assumptions and omissions of the reader."""
+        said = list(self.remarks)
         coloured = next((files for files in self.files.values() if files.colour is not None), None)
-        if coloured is None or coloured.colour is None:
-            return self.remarks
-        colour, depth = image_size(coloured.colour), image_size(coloured.depth)
-        if not is_finer(colour, depth):
-            return self.remarks
-        sizes = f"{colour[0]} x {colour[1]} where depth is {depth[0]} x {depth[1]}"
-        return (*self.remarks, f"colour is {sizes}: it is shrunk, and taken for the depth camera's view")
+        if coloured is not None and coloured.colour is not None:
+            colour, depth = image_size(coloured.colour), depth_size(coloured.depth)
+            if is_finer(colour, depth):
+                sizes = f"{colour[0]} x {colour[1]} where depth is {depth[0]} x {depth[1]}"
+                said.append(f"colour is {sizes}: it is shrunk, and taken for the depth camera's view")
+        masked = next((files.mask for files in self.files.values() if files.mask is not None), None)
+        if masked is not None and graded(masked):
+            said.append("masks are graded from black to white: the brighter half of the range counts as object")
+        return tuple(said)
 
 
 UNIT_MM = 0.2
@@ -159,9 +197,9 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
         raise InputError(f"{path / 'depth.txt'}: lists no depth image; write lines 'time path'.")
     colour = _list(path / "rgb.txt", 2) if is_there(path / "rgb.txt") else []
     folder = first_folder(path, ("mask", "masks"))
-    masks = {} if folder is None else list_images(folder, (".png",))
+    masks = {} if folder is None else list_images(folder, MASK_SUFFIXES)
     occluding = first_folder(path, OCCLUDER_FOLDERS)
-    occluders = {} if occluding is None else list_images(occluding, (".png",))
+    occluders = {} if occluding is None else list_images(occluding, MASK_SUFFIXES)
     pairs, remarks = paired(depth, colour)
     files: dict[int, FrameFiles] = {}
     for index, pair in pairs.items():
@@ -180,7 +218,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
                 f"{len(strange)} of {len(images)} {what} belong to no depth image and are left out ({strange[0]}; give "
                 "each the name of its depth image)"
             )
-    found, (width, height) = find_intrinsics(path, overrides), image_size(files[0].depth)
+    found, (width, height) = find_intrinsics(path, overrides), depth_size(files[0].depth)
     if found is None:
         if (width, height) != (640, 480):
             raise InputError(
@@ -189,12 +227,12 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
             )
         found = CameraFacts(CALIBRATION, "the benchmark")
         remarks.append("no intrinsics: the benchmark's default of 525 525 319.5 239.5 px is assumed")
-    remarks += found.doubts((width, height))
+    remarks += found.remarks((width, height))
     unit_mm, who = found.unit(overrides, (UNIT_MM, "the benchmark's, 5000 per m"))
     return ImageFolderSequence(
         path,
         files=files,
-        intrinsics=found.intrinsics,
+        camera=found,
         depth_scale_mm=unit_mm,
         what="TUM RGB-D folder",
         unit_source=who,
@@ -285,118 +323,162 @@ def _listed(root: Path, by: str, name: str) -> Path:
     return path
 
 
-COLOUR_FOLDERS = ("color", "rgb", "colour", "image")
+DEPTH_FOLDERS = ("depth", "aligned_depth_to_color", "aligned_depth", "depth_images")
+COLOUR_FOLDERS = ("color", "rgb", "colour", "image", "images")
 MASK_FOLDERS = ("masks", "mask")
 OCCLUDER_FOLDERS = ("mask_hand", "masks_hand")
+CONFIDENCE_FOLDERS = ("confidence",)
 POSES = "annotated_poses"
 
 
-def open_colour_depth(path: Path, overrides: Overrides) -> ImageFolderSequence:
-    """Open a folder with `depth/` and intrinsics, and where they are there, colour, masks and masks of hands.
+@final
+@dataclass(frozen=True)
+class FoundImages:
+    """Images of a folder by role and name, in order of their names."""
 
-    Depth is in mm unless the file of intrinsics or the user gives another unit, as in both programs.
+    depth: Mapping[str, Path]
+    """At least one."""
+    colour: Mapping[str, Path] = field(default_factory=dict)
+    """Colour images."""
+    masks: Mapping[str, Path] = field(default_factory=dict)
+    """Masks of the object."""
+    occluders: Mapping[str, Path] = field(default_factory=dict)
+    """Masks of hands."""
+    confidence: Mapping[str, Path] = field(default_factory=dict)
+    """Confidence of depth."""
+
+
+def images_in_folders(path: Path) -> FoundImages:
+    """Return the images in the folders `depth`, `rgb`, `masks` and others of such names.
+
+    Raises:
+        InputError: if there are no depth images.
+    """
+
+    def within(names: tuple[str, ...], suffixes: tuple[str, ...]) -> dict[str, Path]:
+        folder = first_folder(path, names)
+        return {} if folder is None else list_images(folder, suffixes)
+
+    folder = first_folder(path, DEPTH_FOLDERS) or path / DEPTH_FOLDERS[0]
+    depth = list_images(folder, SUFFIXES)
+    if not depth:
+        raise no_depth(folder, "16-bit PNG or TIFF images")
+    return FoundImages(
+        depth,
+        within(COLOUR_FOLDERS, COLOUR_SUFFIXES),
+        within(MASK_FOLDERS, MASK_SUFFIXES),
+        within(OCCLUDER_FOLDERS, MASK_SUFFIXES),
+        within(CONFIDENCE_FOLDERS, MASK_SUFFIXES),
+    )
+
+
+def images_in_one_folder(path: Path) -> FoundImages | None:
+    """Return the images of a folder in which names state what they are, as in `7_depth.png`; None without depth."""
+    by_role: dict[str, dict[str, Path]] = {}
+    for image in entries(path):
+        suffix = image.suffix.lower()
+        if image.name.startswith(".") or suffix not in (*SUFFIXES, *COLOUR_SUFFIXES):
+            continue
+        role, name = role_of(image.stem)
+        role = role or "colour"
+        if suffix in (SUFFIXES if role == "depth" else COLOUR_SUFFIXES):
+            named = by_role.setdefault(role, {})
+            if name in named:
+                raise InputError(f"{image}: there is {named[name].name} too; remove one of them.")
+            named[name] = image
+    if "depth" not in by_role:
+        return None
+    return FoundImages(
+        by_role["depth"], by_role.get("colour", {}), by_role.get("mask", {}), {}, by_role.get("confidence", {})
+    )
+
+
+SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)
+"""Intrinsics that the authors of 7-Scenes recommend for its depth images of 640 x 480."""
+
+
+def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> ImageFolderSequence:
+    """Open a folder with depth images and intrinsics, and where they are there, colour, masks and masks of hands.
+
+    Depth of whole numbers is in mm unless the file of intrinsics or the user gives another unit.
+
+    Args:
+        path: the folder.
+        found: its images.
+        overrides: values that take precedence over its files.
 
     Raises:
         InputError: if it is not readable as such.
     """
-    depth = list_images(path / "depth", (".png", ".tif", ".tiff"))
-    if not depth:
-        raise no_depth(path / "depth", "16-bit PNG or TIFF images")
-    found = find_intrinsics(path, overrides)
-    if found is None:
+    depth, first = found.depth, next(iter(found.depth.values()))
+    size = depth_size(first)
+    facts = find_intrinsics(path, overrides)
+    if facts is None and _is_seven_scenes(first) and size == (640, 480):
+        facts = CameraFacts(SEVEN_SCENES, "7-Scenes")
+    if facts is None:
         raise InputError(
             f"{path}: no intrinsics; add camera.json with fx, fy, cx and cy in px, cam_K.txt (three rows of K), "
             "camera_intrinsic.json (Open3D's) or scene_camera.json (BOP's), or convert with --intrinsics FX FY CX CY."
         )
+    facts = facts.scaled(size)
     numbers = frame_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}
-    remarks = found.doubts(image_size(next(iter(depth.values()))))
-    colour, left = _partners(path, COLOUR_FOLDERS, (".png", ".jpg", ".jpeg"), depth)
-    masks, left_masks = _partners(path, MASK_FOLDERS, (".png",), depth)
-    occluders, left_occluders = _partners(path, OCCLUDER_FOLDERS, (".png",), depth)
-    for what, partners in (("colour image", colour), ("mask", masks)):  # not every frame has a hand
-        lacking = sum(stem not in partners for stem in depth)
-        if partners and lacking:
-            remarks.append(f"{lacking} of {len(depth)} depth images have no {what}")
-    for what, others in (("colour images", left), ("masks", left_masks), ("masks of hands", left_occluders)):
-        if others:
-            remarks.append(f"{len(others)} {what} belong to no depth image and are left out ({others[0]})")
+    times_s = stamps_s(list(depth)) or {}
+    remarks = facts.remarks(size)
+    roles = {
+        "colour images": found.colour,
+        "masks": found.masks,
+        "masks of hands": found.occluders,
+        "confidence images": found.confidence,
+    }
+    belonging: dict[str, dict[str, Path]] = {}
+    for what, images in roles.items():
+        belonging[what], left, said = partners(images, depth, what)
+        lacking = sum(stem not in belonging[what] for stem in depth)
+        remarks += said
+        if belonging[what] and lacking and what != "masks of hands":  # not every frame has a hand
+            remarks.append(f"{lacking} of {len(depth)} depth images have no {what.removesuffix('s')}")
+        if left:
+            remarks.append(f"{len(left)} {what} belong to no depth image and are left out ({left[0].name})")
+    colour, masks, occluders, confidence = belonging.values()
+    if confidence:
+        remarks.append("depth of confidence 0 is left out")
     files = {
         numbers[stem]: FrameFiles(
-            _time_s(stem, numbers[stem]), image, colour.get(stem), masks.get(stem), occluders.get(stem)
+            times_s.get(stem, float(numbers[stem])),
+            image,
+            colour.get(stem),
+            masks.get(stem),
+            occluders.get(stem),
+            confidence.get(stem),
         )
         for stem, image in depth.items()
     }
-    unit_mm, who = found.unit(overrides, (1.0, "the default"))
+    unit_mm, who = facts.unit(overrides, (1.0, "the default"))
+    if overrides.depth_scale_mm is None and (float_mm := float_unit_mm(read_depth(first))) is not None:
+        unit_mm, who = float_mm, "by its values"
     return ImageFolderSequence(
         path,
         files=dict(sorted(files.items())),
-        intrinsics=found.intrinsics,
+        camera=facts,
         depth_scale_mm=unit_mm,
-        what=_layout(path),
+        what=_layout(path, first),
         unit_source=who,
         read_truth=lambda: _posed_truth(path, numbers),
         remarks=tuple(remarks),
     )
 
 
-def _layout(path: Path) -> str:
-    """Return the name of a folder's layout."""
+def _is_seven_scenes(depth: Path) -> bool:
+    return depth.name.endswith(".depth.png") and is_there(depth.with_name(depth.name.replace(".depth.", ".pose.", 1)))
+
+
+def _layout(path: Path, depth: Path) -> str:
+    """Return the name of a folder's layout, of which one depth image is given."""
     if (path / "cam_K.txt").exists() and first_folder(path, (*MASK_FOLDERS, POSES)) is not None:
         return "BundleSDF folder"
-    return "Open3D folder" if (path / "camera_intrinsic.json").exists() else "folder of pictures"
-
-
-def frame_numbers(stems: list[str]) -> dict[str, int] | None:
-    """Parse frame numbers: whole names, leading digits, or the only digits that differ; None if ambiguous."""
-    for numbered in (stems, [re.split(r"[^0-9]", stem)[0] for stem in stems], _differences(stems)):
-        numbers = [frame_number(stem) for stem in numbered]
-        known = [number for number in numbers if number is not None]
-        if len(set(known)) == len(stems):
-            return dict(zip(stems, known, strict=True))
-    return None
-
-
-def _differences(stems: list[str]) -> list[str]:
-    """Return the digits in which names such as `depth_9` and `depth_10` differ, if nothing else does."""
-    rows = [re.split(r"([0-9]+)", stem) for stem in stems]
-    if len({len(row) for row in rows}) != 1:
-        return []
-    differ = [place for place, words in enumerate(zip(*rows, strict=True)) if len(set(words)) > 1]
-    counted = len(differ) == 1 and differ[0] % 2 == 1 and rows[0][differ[0] - 1] != "."  # which begins a fraction
-    return [row[differ[0]] for row in rows] if counted else []
-
-
-def _time_s(stem: str, number: int) -> float:
-    """Return the time in s of a name that is a time stamp in ns; else the frame number."""
-    return int(stem) * 1e-9 if stem.isascii() and stem.isdigit() and 16 <= len(stem) <= 19 else float(number)
-
-
-def _partners(
-    root: Path, names: tuple[str, ...], suffixes: tuple[str, ...], depth: Mapping[str, Path]
-) -> tuple[dict[str, Path], list[str]]:
-    """Return the images of a folder by the name of the depth image to which they belong, and the names of the others.
-
-    Raises:
-        InputError: if neither names nor numbers nor order match them.
-    """
-    folder = first_folder(root, names)
-    if folder is None:
-        return {}, []
-    found = list_images(folder, suffixes)
-    same = {stem: found[stem] for stem in depth if stem in found}
-    ours, theirs = frame_numbers(list(depth)) or {}, frame_numbers(list(found)) or {}
-    named = {number: stem for stem, number in theirs.items()}
-    alike = {stem: found[named[number]] for stem, number in ours.items() if number in named}
-    best = alike if len(alike) > len(same) else same
-    if best or not found:
-        used = set(best.values())
-        return best, [path.name for path in found.values() if path not in used]
-    if len(found) == len(depth):  # names are times of two clocks
-        return dict(zip(depth, found.values(), strict=True)), []
-    raise InputError(
-        f"{folder}: its {len(found)} images cannot be matched with the {len(depth)} depth images; "
-        "give those of one frame the same name."
-    )
+    if (path / "camera_intrinsic.json").exists():
+        return "Open3D folder"
+    return "folder of pictures" if depth.parent != path else "folder of pictures named by what they show"
 
 
 def _posed_truth(root: Path, numbers: Mapping[str, int]) -> dict[int, Array] | None:

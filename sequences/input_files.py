@@ -237,20 +237,39 @@ class Node:
 
 
 def read_tree(path: Path) -> Node:
-    """Parse a JSON file, or a TOML file by its suffix.
+    """Parse a JSON file, or a TOML or YAML file by its suffix.
 
     Raises:
-        InputError: if the file is missing or is not JSON or TOML.
+        InputError: if the file is missing or is not JSON, TOML or YAML.
     """
-    kind = "TOML" if path.suffix == ".toml" else "JSON"
+    kind = {".toml": "TOML", ".yaml": "YAML", ".yml": "YAML"}.get(path.suffix.lower(), "JSON")
     text = read_text(path, kind)
     if kind == "JSON":
         return Node(parse_json(text, path), path)
     try:
-        return Node(tomllib.loads(text), path)
+        return Node(tomllib.loads(text) if kind == "TOML" else _from_yaml(text), path)
     except (ValueError, RecursionError) as error:
-        why = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
+        why = "nested too deeply" if isinstance(error, RecursionError) else short_message(error, path)
     raise InputError(f"{path}: is not valid {kind} ({why}); correct it there.")
+
+
+_MOST_YAML = 1_000_000  # characters; cameras take one or two thousand, and the parser a minute for this many
+
+
+def _from_yaml(text: str) -> object:
+    """Parse YAML, also OpenCV's, which states version and types in ways of its own."""
+    from ruamel.yaml import YAML  # takes 30 ms
+
+    if len(text) > _MOST_YAML:
+        raise ValueError("it is larger than files of cameras are")
+    text = re.sub(r"\A%YAML:.*\n", "", text.lstrip())
+    try:
+        documents = YAML(typ="safe", pure=True).load_all(re.sub(r"!!opencv-\w+", "", text))
+        return next(iter(documents), None)
+    except RecursionError:
+        raise
+    except Exception as error:  # broken files make the library raise anything
+        raise ValueError(" ".join(str(error).split())) from None
 
 
 def read_text(path: Path, kind: str = "text") -> str:

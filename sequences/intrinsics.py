@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
-from modeler.sequences.input_files import Node, is_there, read_text, read_tree
-from modeler.types import Array, InputError
+from modeler.sequences.input_files import Node, entries, is_there, read_text, read_tree
+from modeler.sequences.lens import Lens, lens_of_model
+from modeler.types import Array, Camera, InputError
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy in px."""
@@ -30,6 +31,8 @@ class Overrides:
     """Topic of the depth images in a ROS bag."""
     colour_topic: str | None = None
     """Topic of the colour images in a ROS bag."""
+    along_ray: bool = False
+    """Stored depth is the distance along the ray, as renderers write it, not along the optical axis."""
     strict_paths: bool = False
     """Refuse a sequence in which a link leads out of it."""
 
@@ -64,11 +67,20 @@ NAMES = (
     "intrinsic.json",
     "intrinsics.json",
     "camera.json",
+    "camera_info.json",
     "calibration.txt",
     "intrinsic_depth.txt",
     "intrinsics.txt",
+    "camera_matrix.csv",
+    "transforms.json",
+    "metadata.json",
+    "metadata",
 )
-"""Files that are looked for, in this order."""
+"""Files that are looked for, in this order; after them, files of YAML (OpenCV, ROS, ORB-SLAM, Kalibr)."""
+OF_COLOUR = ("camera_matrix.csv", "transforms.json", "metadata.json", "metadata")
+"""Of phones: intrinsics of colour images, whose view depth has in fewer pixels."""
+_PHONE_SIZE = (1920, 1440)
+"""Images of Stray Scanner, whose file does not state their size."""
 
 
 @final
@@ -84,6 +96,36 @@ class CameraFacts:
     """Millimetres per unit of depth, where the file says so."""
     size: tuple[int, int] | None = None
     """Width and height in px of the images that the file is of, where it says so."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients of the lens, in the order of the model."""
+    model: str = ""
+    """Name of the distortion model; "" if the file states none."""
+
+    def lens(self, size: tuple[int, int]) -> Lens:
+        """Return the camera, with its lens, for images of (width, height).
+
+        Raises:
+            InputError: if the distortion is by an unknown model.
+        """
+        return lens_of_model(Camera(*size, *self.intrinsics), self.distortion, self.model, self.by)
+
+    def scaled(self, size: tuple[int, int]) -> CameraFacts:
+        """Return the camera for the same view in images of (width, height); itself where shape or size do not fit."""
+        if self.by not in OF_COLOUR or self.size is None or abs(self.size[0] * size[1] / size[0] - self.size[1]) > 2.0:
+            return self
+        factor, (fx, fy, cx, cy) = size[0] / self.size[0], self.intrinsics
+        pixels = (fx * factor, fy * factor, (cx + 0.5) * factor - 0.5, (cy + 0.5) * factor - 0.5)
+        return self if factor == 1.0 else replace(self, intrinsics=pixels, size=size)
+
+    def remarks(self, size: tuple[int, int]) -> list[str]:
+        """Return what is assumed of the camera for images of (width, height), and what is doubtful."""
+        lens = self.lens(size)
+        said = []
+        if lens.is_distorted:
+            numbers = " ".join(f"{value:g}" for value in lens.coefficients)
+            kind = "fisheye lens" if lens.fisheye else "lens distortion"
+            said.append(f"{kind} {numbers} ({self.by}) is taken out of depth, colour and masks")
+        return said + self.doubts(size)
 
     def unit(self, overrides: Overrides, usual: tuple[float, str]) -> tuple[float, str]:
         """Return the millimetres per unit of depth, and its source.
@@ -118,22 +160,38 @@ def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
     """
     if overrides.intrinsics is not None:
         return CameraFacts(overrides.intrinsics, "--intrinsics")
-    for name in NAMES:
-        path = folder / name
-        if is_there(path):
-            return _from_json(read_tree(path), name) if path.suffix == ".json" else CameraFacts(_from_text(path), name)
+    named = [folder / name for name in NAMES]
+    others = [path for path in entries(folder) if path.suffix.lower() in (".yaml", ".yml") and path.name[0] != "."]
+    for path in [*named, *others]:
+        if not is_there(path):
+            continue
+        if path.suffix in ("", ".json", ".yaml", ".yml"):
+            node = read_tree(path)
+            if (path in others or path.name in OF_COLOUR) and not _describes_camera(node):
+                continue  # whatever else has such a name
+            return _from_tree(node, path.name)
+        found = _from_text(path)
+        return replace(found, size=_phone_size(found)) if path.name in OF_COLOUR else found
     return None
+
+
+def _phone_size(found: CameraFacts) -> tuple[int, int]:
+    """Return (width, height) of the images of which a phone's camera has its principal point in the middle."""
+    wide, high = round(2.0 * found.intrinsics[2]), round(2.0 * found.intrinsics[3])
+    usual = next((size for size in (_PHONE_SIZE, _PHONE_SIZE[::-1]) if abs(size[0] - wide) < 0.1 * size[0]), None)
+    return (wide, high) if usual is None else (usual[0], usual[1])
 
 
 _WITHIN = ("intrinsic", "intrinsics")
 _SPACE = str.maketrans(",;[]", "    ")
 
 
-def _from_text(path: Path) -> Intrinsics:
-    """Read a matrix (3, 3) or (4, 4) by rows, or `fx fy cx cy` and anything after it; commas and brackets are space."""
+def _from_text(path: Path) -> CameraFacts:
+    """Read a matrix (3, 3) or (4, 4) by rows, or `fx fy cx cy` and perhaps coefficients of Brown's model."""
     expected = "a matrix of 3 x 3 numbers (fx 0 cx, 0 fy cy, 0 0 1) or a line fx fy cx cy"
     lines = [line for line in read_text(path).translate(_SPACE).splitlines() if not line.startswith("#")]
     rows = [line.split() for line in lines if line.strip()]
+    distortion: tuple[float, ...] = ()
     try:
         numbers = [[float(word) for word in row] for row in rows[:5]]
     except ValueError:
@@ -141,22 +199,91 @@ def _from_text(path: Path) -> Intrinsics:
     if len(numbers) == 1 and len(numbers[0]) >= 4:
         fx, fy, cx, cy = numbers[0][:4]
         found = (fx, fy, cx, cy) if sane((fx, fy, cx, cy)) else None
+        if len(numbers[0]) - 4 in (4, 5, 8) and max(map(abs, numbers[0][4:])) < _MAX_COEFFICIENT:
+            distortion = tuple(numbers[0][4:])
     elif numbers and {len(numbers)} == {len(row) for row in numbers} <= {3, 4}:
         found = of_matrix(np.array(numbers)[:3, :3])
     else:
         found = None
     if found is None:
         raise InputError(f"{path}: does not describe a pinhole camera; it must be {expected}, in px, {RANGE}.")
-    return found
+    return CameraFacts(found, path.name, distortion=distortion)
 
 
-def _from_json(node: Node, name: str) -> CameraFacts:
+_MAX_COEFFICIENT = 100.0
+_SCALES = ("depth_scale", "DepthMapFactor", "depth_unit_scale_factor")
+_WIDTHS, _HEIGHTS = ("width", "w", "image_width", "Camera.width"), ("height", "h", "image_height", "Camera.height")
+
+
+def _describes_camera(node: Node) -> bool:
+    """Return whether a tree holds intrinsics in whichever spelling."""
+    if not isinstance(node.value, dict):
+        return False
+    keys = {str(key) for key in node.value}
+    return bool(keys & {"fl_x", "fx", "Camera.fx", "Camera1.fx", "cam0", *_MATRICES, *_WITHIN})
+
+
+def _from_tree(node: Node, name: str) -> CameraFacts:
     """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name."""
-    scale = node.get("depth_scale")
-    node = next((within for key in _WITHIN if (within := node.get(key)) is not None), node)
-    width, height = node.get("width"), node.get("height")
+    scale = _first(node, _SCALES)
+    node = next((within for key in ("cam0", *_WITHIN) if (within := _inner(node, key)) is not None), node)
+    width, height = _first(node, _WIDTHS), _first(node, _HEIGHTS)
     size = None if width is None or height is None else (int(width.number(1.0, 1e5)), int(height.number(1.0, 1e5)))
-    return CameraFacts(_pinhole(node), name, None if scale is None else _unit_mm(scale), size)
+    model = next((found for key in _MODELS if (found := node.get(key)) is not None), None)
+    return CameraFacts(
+        _pinhole(node),
+        name,
+        None if scale is None else _unit_mm(scale),
+        size,
+        _distortion(node),
+        model.value if model is not None and isinstance(model.value, str) else "",
+    )
+
+
+def _first(node: Node, keys: tuple[str, ...]) -> Node | None:
+    return next((found for key in keys if (found := node.get(key)) is not None), None)
+
+
+def _inner(node: Node, key: str) -> Node | None:
+    """Return an entry that is an object itself."""
+    found = node.get(key)
+    return found if found is not None and isinstance(found.value, dict) else None
+
+
+_MODELS = ("distortion_model", "camera_model", "distortion_type", "model", "Camera.type")
+_COEFFICIENTS = (
+    "coeffs", "coefficients", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs", "distortion",
+    "dist", "D", "d",
+)  # fmt: skip
+_BY_NAME = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE_BY_NAME = ("k1", "k2", "k3", "k4")
+
+
+def _distortion(node: Node) -> tuple[float, ...]:
+    """Return the coefficients of a lens beside intrinsics, in whichever spelling; () without."""
+    entry = _first(node, _COEFFICIENTS)
+    if entry is not None and isinstance(entry.value, dict):
+        entry = entry if (data := entry.get("data")) is None else data
+    if entry is not None and isinstance(entry.value, list):
+        found = [number for each in entry.elements() for number in (each.elements() if _is_row(each) else [each])]
+        return tuple(number.number() for number in found[:_MOST_COEFFICIENTS])
+    node = node if entry is None else entry
+    if not isinstance(node.value, dict):
+        return ()
+    prefix = next((start for start in ("Camera.", "Camera1.", "") if node.get(f"{start}k1") is not None), None)
+    if prefix is None:
+        return ()
+    fisheye = node.get("p1") is None and node.get(f"{prefix}p1") is None and node.get(f"{prefix}k4") is not None
+    names = _FISHEYE_BY_NAME if fisheye else _BY_NAME
+    values = (node.get(f"{prefix}{name}") for name in names)
+    return tuple(0.0 if value is None else value.number() for value in values)
+
+
+_MOST_COEFFICIENTS = 14
+
+
+def _is_row(node: Node) -> bool:
+    return isinstance(node.value, list)
 
 
 def _unit_mm(scale: Node) -> float:
@@ -176,22 +303,28 @@ def _unit_mm(scale: Node) -> float:
     raise scale.fault("millimetres per unit of depth, as in 1 or 0.1")
 
 
-_MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K")
+_MATRICES = ("intrinsic_matrix", "camera_matrix", "cameraMatrix", "cam_K", "K", "k", "intrinsics")
+_NAMED = (
+    ("fx", "fy", "cx", "cy"),
+    ("fx", "fy", "ppx", "ppy"),
+    ("fl_x", "fl_y", "cx", "cy"),
+    ("Camera.fx", "Camera.fy", "Camera.cx", "Camera.cy"),
+    ("Camera1.fx", "Camera1.fy", "Camera1.cx", "Camera1.cy"),
+)
 
 
 def _pinhole(node: Node) -> Intrinsics:
-    """Return the intrinsics that an object of a JSON file holds, in whichever spelling."""
-    names = next(
-        (names for names in (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy")) if node.get(names[2])), None
-    )
+    """Return the intrinsics that an object of a tree holds, in whichever spelling."""
+    names = next((names for names in _NAMED if node.get(names[0]) and node.get(names[2])), None)
+    names = names or next((names for names in _NAMED if node.get(names[2])), None)
     if names is not None:
-        fx, fy, cx, cy = (node.need(name).number() for name in names)
-        if not sane((fx, fy, cx, cy)):
-            raise node.fault(f"intrinsics in px, {RANGE}")
-        return fx, fy, cx, cy
+        return _as_sane(node, [node.need(name).number() for name in names])
     entry = next((found for key in _MATRICES if (found := node.get(key)) is not None), None)
     if entry is None:
         raise node.fault("intrinsics, with fx, fy, cx and cy in px, or with their matrix as intrinsic_matrix")
+    entry = entry if _is_row(entry) or (data := _inner(node, entry.keys[-1])) is None else data.need("data")
+    if isinstance(entry.value, list) and len(entry.value) == 4:  # Kalibr's
+        return _as_sane(entry, entry.numbers(4).tolist())
     if isinstance(entry.value, list) and len(entry.value) == 3:
         matrix = np.stack([row.numbers(3) for row in entry.elements()])
     else:
@@ -200,6 +333,13 @@ def _pinhole(node: Node) -> Intrinsics:
     if found is None:
         raise entry.fault(f"the matrix of a pinhole camera in px, {RANGE}")
     return found
+
+
+def _as_sane(node: Node, numbers: list[float]) -> Intrinsics:
+    fx, fy, cx, cy = numbers
+    if not sane((fx, fy, cx, cy)):
+        raise node.fault(f"intrinsics in px, {RANGE}")
+    return fx, fy, cx, cy
 
 
 def of_matrix(matrix: Array) -> Intrinsics | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,20 +21,34 @@ Pixel = TypeVar("Pixel", np.uint8, np.uint16, np.float32)
 @final
 @dataclass(frozen=True)
 class Lens:
-    """A camera with radial and tangential distortion, with the coefficients of ROS, OpenCV and the Kinect."""
+    """A camera with radial and tangential distortion, with the coefficients of ROS, OpenCV and the Kinect.
+
+    Depth must not be mixed from several pixels, and undistorting by the nearest one takes a dozen lines; a library of
+    lenses, such as OpenCV with its 50 MB, would save none of the rest here.
+    """
 
     camera: Camera
     """Intrinsics, of the distorted and the undistorted image alike."""
     coefficients: tuple[float, ...]
-    """k1 k2 p1 p2 k3 (`plumb_bob`), and k4 k5 k6 for `rational_polynomial`."""
+    """k1 k2 p1 p2 k3 (`plumb_bob`), and k4 k5 k6 for `rational_polynomial`; k1 k2 k3 k4 of a fisheye."""
+    fisheye: bool = False
+    """Whether the coefficients are of the angle from the optical axis (Kannala and Brandt 2006; ROS `equidistant`)."""
 
     @property
     def is_distorted(self) -> bool:
         """Whether any coefficient is not zero."""
-        return any(abs(value) > 1e-9 for value in self.coefficients)
+        return self.fisheye or any(abs(value) > 1e-9 for value in self.coefficients)
 
     def distort(self, w: Array, h: Array) -> tuple[Array, Array]:
         """Return where rays (w, h) = (x/z, y/z) of any shape appear as rays of a camera without distortion."""
+        if self.fisheye:
+            k1, k2, k3, k4 = (*self.coefficients, *([0.0] * 4))[:4]
+            radius = np.hypot(w, h)
+            angle = np.arctan(radius)
+            square = angle**2
+            bent = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+            scale = np.divide(bent, radius, out=np.ones_like(radius), where=radius > 1e-12)
+            return w * scale, h * scale
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.coefficients, *([0.0] * 8))[:8]
         square = w**2 + h**2
         radial = 1.0 + square * (k1 + square * (k2 + square * k3))
@@ -68,9 +83,11 @@ class Lens:
         return np.where(inside, rows, 0).astype(np.intp), np.where(inside, columns, 0).astype(np.intp), inside
 
 
-_NO_NAME = ("", "None")
-_BROWN = ("plumb_bob", "rational_polynomial", "Brown Conrady", "Modified Brown Conrady", "Inverse Brown Conrady")
-"""RealSense's library projects by one formula in all three models of that name, to 0.02 px."""
+_BROWN = ("plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_conrady", "inverse_brown_conrady",
+          "radtan", "radial_tangential", "opencv", "pinhole", "perspective", "none", "")  # fmt: skip
+"""RealSense's library projects by one formula in its three models of Brown and Conrady, to 0.02 px."""
+_FISHEYE = ("equidistant", "fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "equi")
+_BROWN_COUNT = 8
 
 
 def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where: str) -> Lens:
@@ -85,9 +102,15 @@ def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where
     Raises:
         InputError: if there is distortion by an unknown model.
     """
-    found = Lens(camera, coefficients(distortion))
-    if found.is_distorted and model not in _NO_NAME + _BROWN:
-        raise InputError(f"{where}: its distortion model {model!r} is not known; record the rectified topic.")
+    values, name = coefficients(distortion), re.sub(r"[\s-]+", "_", model.strip().lower())
+    if name in _FISHEYE and len(values) <= 4:
+        return Lens(camera, values, fisheye=True)
+    found = Lens(camera, values)
+    if found.is_distorted and (name not in _BROWN or len(values) > _BROWN_COUNT):
+        raise InputError(
+            f"{where}: its distortion model {model!r} with {len(values)} coefficients is not known; "
+            "use rectified images."
+        )
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.sequences.base import AbstractSequence, check_every, span
-from modeler.sequences.image_files import metres
+from modeler.sequences.depth_files import metres
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens, coefficients
 from modeler.types import Array, Camera, Frame, InputError, SensorNoise

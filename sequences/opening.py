@@ -11,8 +11,15 @@ from modeler.sequences.bop import BopSequence
 from modeler.sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
 from modeler.sequences.clouds import open_clouds
 from modeler.sequences.hand_shapes import with_hand
-from modeler.sequences.image_folders import COLOUR_FOLDERS, open_colour_depth, open_tum
-from modeler.sequences.input_files import check_links, entries, is_there
+from modeler.sequences.image_folders import (
+    COLOUR_FOLDERS,
+    DEPTH_FOLDERS,
+    images_in_folders,
+    images_in_one_folder,
+    open_colour_depth,
+    open_tum,
+)
+from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import SCHEME, open_camera
 from modeler.system.regular_files import check_regular
@@ -80,8 +87,10 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
         return BopSequence(path, overrides)
     if is_there(path / "depth.txt"):
         return open_tum(path, overrides)
-    if (path / "depth").is_dir():
-        return open_colour_depth(path, overrides)
+    if first_folder(path, DEPTH_FOLDERS) is not None:
+        return open_colour_depth(path, images_in_folders(path), overrides)
+    if (found := images_in_one_folder(path)) is not None:
+        return open_colour_depth(path, found, overrides)
     raise InputError(f"{path}: {_advice(path)}")
 
 
@@ -95,9 +104,11 @@ def _is_text(path: Path) -> bool:
 
 def _holds_clouds(path: Path) -> bool:
     """Return whether a folder holds clouds and no depth images."""
-    if not path.is_dir() or any((path / mark).exists() for mark in ("scene_camera.json", "depth.txt", "depth")):
+    marks = ("scene_camera.json", "depth.txt", *DEPTH_FOLDERS)
+    if not path.is_dir() or any((path / mark).exists() for mark in marks):
         return False
-    return any(entry.suffix.lower() in CLOUD_SUFFIXES for entry in entries(path))
+    clouds = any(entry.suffix.lower() in CLOUD_SUFFIXES for entry in entries(path))
+    return clouds and images_in_one_folder(path) is None
 
 
 def _folders(path: Path) -> list[str]:

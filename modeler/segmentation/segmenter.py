@@ -24,7 +24,7 @@ from modeler.segmentation.planes import choose_support, dominant_planes, fit_bes
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
 from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
 from modeler.views.range_noise import range_noise
-from modeler.views.sparsity import interpolated
+from modeler.views.sparsity import closed, gap_px, interpolated, measured_share
 
 _NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
@@ -242,9 +242,17 @@ class Segmenter:
 
 
 def _interpolated(frame: Frame) -> Frame:
-    """Return a frame without depth of occluders, and with interpolated depth if measurements are sparse."""
+    """Return a frame without depth of occluders, and with interpolated depth if measurements are sparse.
+
+    So is a mask that holds nothing but measurements, as programs make it that segment points.
+    """
     known = frame.unoccluded
-    return replace(known, depth_m=interpolated(known.depth_m, frame.camera)).unoccluded
+    dense_m, mask = interpolated(known.depth_m, frame.camera), known.mask
+    if mask is not None and dense_m is not known.depth_m:
+        measured = known.depth_m > 0.0
+        if not (mask & ~measured).any():
+            mask = closed(mask, gap_px(measured_share(measured)))
+    return replace(known, depth_m=dense_m, mask=mask).unoccluded
 
 
 def _measured(frame: Frame) -> Float32Array:

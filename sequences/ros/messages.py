@@ -9,7 +9,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, read_depth
+from modeler.sequences.depth_files import read_depth
+from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour
 from modeler.sequences.intrinsics import sane
 from modeler.sequences.lens import Lens, lens_of_model
 from modeler.sequences.ros.bag import MAX_BYTES, from_zstd

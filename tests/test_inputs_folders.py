@@ -1,0 +1,355 @@
+"""Folders as people have them: images named and stored in ways of other programs, with lenses and masks of theirs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+from recordings import raw_depth, save
+from scipy import ndimage
+
+from modeler.segmentation import Segmenter
+from modeler.sequences import Overrides, open_sequence, survey
+from modeler.types import Camera, Frame, InputError
+
+
+def write_camera(folder: Path, camera: Camera, **more: object) -> None:
+    facts = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    (folder / "camera.json").write_text(json.dumps(facts | more))
+
+
+def exr(path: Path, depth_m: np.ndarray, channel: str = "Z") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {channel: depth_m}) as file:
+        file.write(str(path))
+
+
+def pgm(path: Path, units: np.ndarray) -> None:
+    head = f"P5\n# a comment\n{units.shape[1]} {units.shape[0]}\n4000\n".encode()
+    path.write_bytes(head + units.astype(">u2").tobytes())
+
+
+def write_npz(path: Path, depth_m: np.ndarray) -> None:
+    np.savez_compressed(path, depth=depth_m)
+
+
+WRITERS: dict[str, tuple[Callable[[Path, np.ndarray], object], float]] = {
+    "exr": (exr, 1.0),
+    "npy": (np.save, 1.0),
+    "npz": (write_npz, 1.0),
+    "tiff": (save, 1.0),
+    "npy in mm": (np.save, 1000.0),
+    "pgm": (lambda path, units: pgm(path, np.rint(units)), 1000.0),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_depth_is_read_in_each_format(tmp_path: Path, frames: list[Frame], kind: str) -> None:
+    write, units = WRITERS[kind]
+    (tmp_path / "depth").mkdir()
+    for frame in frames:
+        stored = (np.nan_to_num(frame.depth_m) * np.float32(units)).astype(np.float32)
+        write(tmp_path / "depth" / f"{frame.index}.{kind.split()[0]}", stored)
+    write_camera(tmp_path, frames[0].camera)
+    sequence = open_sequence(tmp_path)
+    assert sequence.depth_unit.startswith("1000 mm (by its values)" if units == 1.0 else "1 mm")
+    for read, wrote in zip(sequence, frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=1e-6)
+
+
+@pytest.mark.parametrize("nothing", [65504.0, 1e10, np.inf, -1.0])
+def test_what_programs_write_for_nothing_is_no_depth(tmp_path: Path, frames: list[Frame], nothing: float) -> None:
+    depth_m = np.where(np.isnan(frames[0].depth_m), np.float32(nothing), frames[0].depth_m)
+    exr(tmp_path / "depth" / "0.exr", depth_m.astype(np.float32), "V")
+    write_camera(tmp_path, frames[0].camera)
+    np.testing.assert_array_equal(open_sequence(tmp_path).frame(0).depth_m, frames[0].depth_m)
+
+
+def test_the_largest_whole_number_is_no_depth(tmp_path: Path, frames: list[Frame]) -> None:
+    units = raw_depth(frames[0], 1.0)
+    units[units == 0] = 65535
+    save(tmp_path / "depth" / "0.png", units)
+    write_camera(tmp_path, frames[0].camera)
+    np.testing.assert_allclose(open_sequence(tmp_path).frame(0).depth_m, frames[0].depth_m, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "content", [b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (99999, 99999), }"]
+)
+def test_arrays_that_claim_to_be_enormous_are_refused(tmp_path: Path, frames: list[Frame], content: bytes) -> None:
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "depth" / "0.npy").write_bytes(content.ljust(128) + b"\n")
+    write_camera(tmp_path, frames[0].camera)
+    with pytest.raises(InputError, match=r"0\.npy: is not a readable NPY file"):
+        open_sequence(tmp_path)
+
+
+NAMES: dict[str, tuple[str, str | None, str | None]] = {
+    "suffixes": ("{0}_depth.png", "{0}.jpg", "{0}_mask.jpg"),
+    "7-Scenes": ("frame-{0:06d}.depth.png", "frame-{0:06d}.color.png", None),
+    "Washington": ("cup_1_1_{0}_depth.png", "cup_1_1_{0}.png", None),
+    "ticks": ("DepthImage_{1}_{0}.png", None, None),
+    "in front": ("frame_{0}_depth.png", "frame_{0}_rgb.bmp", "frame_{0}_mask.png"),
+    "aligned": ("aligned_depth_to_color/{0}.png", "color/{0}.png", "masks/{0}.jpg"),
+    "bitmaps": ("depth/{0}.png", "rgb/{0}.bmp", "mask/{0}.bmp"),
+}
+
+
+@pytest.mark.parametrize("kind", NAMES)
+def test_names_state_what_images_are(tmp_path: Path, frames: list[Frame], kind: str) -> None:
+    depth, colour, mask = NAMES[kind]
+    numbers = [7, 8, 9, 10]
+    for number, frame in zip(numbers, frames, strict=True):
+        ticks = 636000000000000000 + 5000000 * number
+        save(tmp_path / depth.format(number, ticks), raw_depth(frame, 1.0))
+        if colour is not None and frame.colour is not None:
+            save(tmp_path / colour.format(number), frame.colour)
+        if mask is not None and frame.mask is not None:
+            save(tmp_path / mask.format(number), frame.mask.astype(np.uint8) * 255)
+    write_camera(tmp_path, frames[0].camera)
+    sequence = open_sequence(tmp_path)
+    assert sequence.indices == tuple(numbers)
+    for read, wrote in zip(sequence, frames, strict=True):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, atol=1e-6)
+        assert (read.colour is None, read.mask is None) == (colour is None, mask is None)
+        if read.colour is not None and wrote.colour is not None:
+            assert np.abs(read.colour.astype(float) - wrote.colour).mean() < 3.0
+        if read.mask is not None and wrote.mask is not None:
+            assert np.count_nonzero(read.mask ^ wrote.mask) <= 0.02 * np.count_nonzero(wrote.mask)
+    if kind == "ticks":
+        np.testing.assert_allclose(np.diff([frame.time_s for frame in sequence]), 0.5, atol=1e-4)
+
+
+LENS = (-0.28, 0.09, 0.001, -0.002, 0.01)
+
+
+def opencv(camera: Camera) -> str:
+    data = f"[{camera.fx}, 0., {camera.cx}, 0., {camera.fy}, {camera.cy}, 0., 0., 1.]"
+    return (
+        "%YAML:1.0\n---\nimage_width: 160\nimage_height: 120\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
+        f"   dt: d\n   data: {data}\ndistortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        f"   data: {list(LENS)}\n"
+    )
+
+
+def ros(camera: Camera) -> str:
+    data = f"[{camera.fx}, 0, {camera.cx}, 0, {camera.fy}, {camera.cy}, 0, 0, 1]"
+    return f"width: 160\nheight: 120\ndistortion_model: plumb_bob\nD: {list(LENS)}\nK: {data}\n"
+
+
+def orb_slam(camera: Camera) -> str:
+    names = (*zip(("fx", "fy", "cx", "cy"), (camera.fx, camera.fy, camera.cx, camera.cy), strict=True),
+             *zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True))  # fmt: skip
+    return "%YAML:1.0\n" + "".join(f"Camera.{name}: {value}\n" for name, value in names) + "DepthMapFactor: 1000.0\n"
+
+
+def kalibr(camera: Camera) -> str:
+    pixels = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return (
+        f"cam0:\n  camera_model: pinhole\n  intrinsics: {pixels}\n  distortion_model: radtan\n"
+        f"  distortion_coeffs: {list(LENS)}\n  resolution: [160, 120]\n"
+    )
+
+
+def as_json(**more: object) -> Callable[[Camera], str]:
+    facts = lambda camera: {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}  # noqa: E731
+    return lambda camera: json.dumps(facts(camera) | more)
+
+
+CAMERAS: dict[str, tuple[str, Callable[[Camera], str]]] = {
+    "RealSense": ("camera.json", as_json(model="brown_conrady", coeffs=list(LENS))),
+    "by name": ("camera.json", as_json(k1=LENS[0], k2=LENS[1], p1=LENS[2], p2=LENS[3], k3=LENS[4])),
+    "OpenCV": ("calib.yml", opencv),
+    "ROS": ("camera_info.yaml", ros),
+    "ORB-SLAM": ("TUM1.yaml", orb_slam),
+    "Kalibr": ("camchain.yaml", kalibr),
+    "line": ("calibration.txt", lambda c: f"{c.fx} {c.fy} {c.cx} {c.cy} {' '.join(map(str, LENS))}"),
+}
+
+
+def distorted(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return an image as a lens shows it: each of its pixels looks up the ray that reaches it, found by iteration."""
+    k1, k2, p1, p2, k3 = LENS
+    rays = [np.array(each) for each in camera.rays()]
+    w, h = rays
+    for _ in range(40):
+        s = w**2 + h**2
+        radial = 1.0 + s * (k1 + s * (k2 + s * k3))
+        w, h = (
+            (rays[0] - 2.0 * p1 * w * h - p2 * (s + 2.0 * w**2)) / radial,
+            (rays[1] - p1 * (s + 2.0 * h**2) - 2.0 * p2 * w * h) / radial,
+        )
+    return ndimage.map_coordinates(image, [h * camera.fy + camera.cy, w * camera.fx + camera.cx], order=0)
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_lenses_beside_the_intrinsics_are_taken_out(tmp_path: Path, frames: list[Frame], kind: str) -> None:
+    name, text = CAMERAS[kind]
+    frame, camera = frames[0], replace(frames[0].camera, fx=90.0, fy=90.0)
+    assert frame.mask is not None
+    assert frame.colour is not None
+    save(tmp_path / "depth" / "0.png", distorted(raw_depth(frame, 1.0), camera))
+    save(tmp_path / "masks" / "0.png", distorted(frame.mask.astype(np.uint8) * 255, camera))
+    colour = [distorted(frame.colour[..., channel], camera) for channel in range(3)]
+    save(tmp_path / "rgb" / "0.png", np.stack(colour, axis=2))
+    (tmp_path / name).write_text(text(camera))
+    sequence = open_sequence(tmp_path)
+    read = sequence.frame(0)
+    assert any("-0.28 0.09" in note and "taken out" in note for note in sequence.notes)
+    assert read.mask is not None
+    assert read.colour is not None
+    assert np.count_nonzero(read.mask ^ frame.mask) < 0.1 * np.count_nonzero(frame.mask)
+    seen = ~np.isnan(read.depth_m + frame.depth_m + distorted(frame.depth_m, camera))
+    for mended, bent, true in (
+        (read.depth_m, distorted(frame.depth_m, camera), frame.depth_m),
+        (read.colour[..., 0].astype(float), colour[0].astype(float), frame.colour[..., 0].astype(float)),
+    ):
+        assert np.abs(mended - true)[seen].mean() < 0.4 * np.abs(bent - true)[seen].mean()
+
+
+def test_a_fisheye_is_taken_out(tmp_path: Path, frames: list[Frame]) -> None:
+    camera = replace(frames[0].camera, fx=60.0, fy=60.0)
+    w, h = camera.rays()
+    angle = np.hypot(w, h)  # of the fisheye's pixels, without coefficients
+    stretch = np.tan(angle) / np.maximum(angle, 1e-12)
+    slanted = np.rint(1000.0 / (1.0 + 0.3 * w * stretch + 0.2 * h * stretch)).clip(1, 60000)  # of a plane
+    save(tmp_path / "depth" / "0.png", slanted.astype(np.uint16))
+    write_camera(tmp_path, camera, model="OPENCV_FISHEYE", coeffs=[0, 0, 0, 0])
+    read = open_sequence(tmp_path).frame(0).depth_m
+    expected = 1.0 / (1.0 + 0.3 * w + 0.2 * h)
+    assert float(np.nanquantile(np.abs(read - expected)[30:90, 40:120], 0.99)) < 0.012  # the nearest pixel's
+
+
+def test_unknown_lenses_are_refused(tmp_path: Path, frames: list[Frame]) -> None:
+    save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
+    write_camera(tmp_path, frames[0].camera, model="division", coeffs=[0.1, 0, 0, 0])
+    with pytest.raises(InputError, match="distortion model 'division'"):
+        open_sequence(tmp_path)
+
+
+def test_images_are_paired_by_the_times_in_their_names(tmp_path: Path, frames: list[Frame]) -> None:
+    """Colour lags by 11 ms, lacks one image, and has one halfway between two: as many as depth images."""
+    for frame in frames:
+        time_s = 1700000000.0 + 0.5 * frame.index
+        save(tmp_path / "depth" / f"{time_s:.6f}.png", raw_depth(frame, 1.0))
+        assert frame.colour is not None
+        if frame.index != 1:
+            save(tmp_path / "rgb" / f"{time_s + 0.011:.6f}.png", frame.colour)
+    assert frames[2].colour is not None
+    save(tmp_path / "rgb" / "1700000001.260000.png", frames[2].colour)
+    write_camera(tmp_path, frames[0].camera)
+    sequence = open_sequence(tmp_path)
+    for read, wrote in zip(sequence, frames, strict=True):
+        if wrote.index == 1:
+            assert read.colour is None
+        else:
+            np.testing.assert_array_equal(read.colour, wrote.colour)
+        assert read.time_s == pytest.approx(1700000000.0 + 0.5 * wrote.index)
+    notes = " ".join(sequence.notes)
+    assert "by the times in their names, up to 11 ms apart" in notes
+    assert "1 of 4 depth images have no colour image" in notes
+    assert "1700000001.260000.png" in notes
+    (tmp_path / "rgb" / "1700000001.260000.png").unlink()  # then fewer than depth images
+    assert [frame.colour is None for frame in open_sequence(tmp_path)] == [False, True, False, False]
+
+
+MASKS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "soft": lambda mask: ndimage.gaussian_filter(mask * 255.0, 2.0),
+    "veiled": lambda mask: np.where(mask, 255.0, 2.0),
+    "half veiled": lambda mask: np.where(mask, 255.0, np.where(np.arange(160) < 80, 2.0, 0.0)),
+    "labels": lambda mask: mask * 3.0,
+    "two labels": lambda mask: mask * np.where(np.arange(160) < 80, 1.0, 2.0),
+}
+
+
+@pytest.mark.parametrize("kind", MASKS)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_masks_count_from_the_middle_of_their_range(
+    tmp_path: Path, frames: list[Frame], kind: str, channels: int
+) -> None:
+    mask = frames[0].mask
+    assert mask is not None
+    grey = MASKS[kind](mask).astype(np.uint8)
+    save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
+    save(tmp_path / "masks" / "0.png", grey if channels == 1 else np.repeat(grey[..., None], 3, axis=2))
+    write_camera(tmp_path, frames[0].camera)
+    sequence = open_sequence(tmp_path)
+    read = sequence.frame(0).mask
+    assert read is not None
+    inner = np.asarray(ndimage.binary_erosion(mask, iterations=2))
+    rim = np.asarray(ndimage.binary_dilation(mask, iterations=2)) & ~inner
+    np.testing.assert_array_equal(read[~rim] if kind == "soft" else read, mask[~rim] if kind == "soft" else mask)
+    assert any("brighter half" in note for note in sequence.notes) == ("labels" not in kind)
+
+
+def test_cut_out_objects_are_masks(tmp_path: Path, frames: list[Frame]) -> None:
+    mask, colour = frames[0].mask, frames[0].colour
+    assert mask is not None
+    assert colour is not None
+    save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
+    save(tmp_path / "masks" / "0.png", np.dstack([colour, mask.astype(np.uint8) * 255]))
+    write_camera(tmp_path, frames[0].camera)
+    np.testing.assert_array_equal(open_sequence(tmp_path).frame(0).mask, mask)
+
+
+def test_masks_of_measured_pixels_hold_what_lies_between(frames: list[Frame], rng: np.random.Generator) -> None:
+    """Nine of ten measurements are missing, and the mask is made of those that are there."""
+    frame = frames[0]
+    assert frame.mask is not None
+    kept = rng.random(frame.depth_m.shape) < 0.1
+    sparse = replace(frame, depth_m=np.where(kept, frame.depth_m, np.float32(np.nan)))
+    segmenter = Segmenter(min_points=20)
+
+    def found(mask: np.ndarray) -> np.ndarray:
+        masked = replace(sparse, mask=mask)
+        return segmenter.segment(masked, segmenter.scene([masked])).mask
+
+    points, whole = found(frame.mask & kept & (frame.depth_m > 0.0)), found(frame.mask)
+    assert np.count_nonzero(points & whole) > 0.6 * np.count_nonzero(whole)  # to the outermost measurements
+    assert np.count_nonzero(points & ~whole) < 0.1 * np.count_nonzero(whole)
+
+
+def test_depth_that_its_camera_does_not_trust_is_left_out(tmp_path: Path, frames: list[Frame]) -> None:
+    """Stray Scanner: intrinsics of colour of 1920 x 1440, whose view depth has in fewer pixels."""
+    camera, confidence = frames[0].camera, np.full((120, 160), 2, np.uint8)
+    confidence[:, :40] = 0
+    save(tmp_path / "depth" / "000000.png", raw_depth(frames[0], 1.0))
+    save(tmp_path / "confidence" / "000000.png", confidence)
+    matrix = f"{12 * camera.fx}, 0.0, 960.0\n0.0, {12 * camera.fy}, 720.0\n0.0, 0.0, 1.0\n"
+    (tmp_path / "camera_matrix.csv").write_text(matrix)
+    read = open_sequence(tmp_path).frame(0)
+    assert read.camera.fx == pytest.approx(camera.fx)
+    assert read.camera.cx == pytest.approx(79.5, abs=0.1)
+    assert np.isnan(read.depth_m[:, :40]).all()
+    np.testing.assert_allclose(read.depth_m[:, 40:], frames[0].depth_m[:, 40:], atol=1e-6)
+
+
+def test_files_of_yaml_without_a_camera_are_passed_over(tmp_path: Path, frames: list[Frame]) -> None:
+    save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
+    (tmp_path / "config.yaml").write_text("exposure: 3\n")
+    with pytest.raises(InputError, match="no intrinsics"):
+        open_sequence(tmp_path)
+    (tmp_path / "broken.yaml").write_text("a: [1, 2")
+    with pytest.raises(InputError, match=r"broken\.yaml: is not valid YAML"):
+        open_sequence(tmp_path)
+    read = open_sequence(tmp_path, Overrides(intrinsics=(100.0, 101.0, 80.0, 60.0)))
+    assert survey(read).cameras[0].fy == 101.0
+
+
+def test_palette_masks_are_labels(tmp_path: Path, frames: list[Frame]) -> None:
+    mask = frames[0].mask
+    assert mask is not None
+    save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
+    (tmp_path / "masks").mkdir()
+    labels = Image.fromarray(mask.astype(np.uint8), mode="P")
+    labels.putpalette([0, 0, 0, 128, 0, 0])
+    labels.save(tmp_path / "masks" / "0.png")
+    write_camera(tmp_path, frames[0].camera)
+    np.testing.assert_array_equal(open_sequence(tmp_path).frame(0).mask, mask)
