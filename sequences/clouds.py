@@ -1,4 +1,8 @@
-"""Organised point clouds (PCD, PLY): a point a pixel, from which the depth image and its camera are taken back."""
+"""Point clouds (PCD, PLY) of a depth camera: the depth image and its camera are taken back from the points.
+
+Organised clouds have a point a pixel. Of others the camera is known, or points lie on the rays of its pixels: then x/z
+and y/z are whole numbers, but for a factor, the focal length, and an offset, the principal point.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,6 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, final
 
@@ -17,7 +20,7 @@ import numpy.typing as npt
 from modeler.sequences.file_names import frame_numbers
 from modeler.sequences.image_files import MAX_PIXELS
 from modeler.sequences.input_files import input_errors, list_images
-from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
+from modeler.sequences.intrinsics import Intrinsics, Overrides, find_intrinsics, sane
 from modeler.sequences.recording import AbstractRecording
 from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import Array, Camera, Frame, InputError
@@ -39,16 +42,24 @@ class CloudSequence(AbstractRecording):
     """By frame number, ascending."""
     unit_mm: float
     """Millimetres per unit of the coordinates."""
-    given: Intrinsics | None
-    """Intrinsics that take precedence over fitted ones."""
+    unit_source: str
+    """Source of the unit."""
+    camera: Camera
+    """The camera."""
+    backward: bool = False
+    """Whether y points up and z backward, as viewers have it."""
+    is_organised: bool = True
+    """Whether each cloud has a point a pixel."""
+    remarks: tuple[str, ...] = ()
+    """Assumptions and omissions of the reader."""
 
     def __post_init__(self) -> None:
-        """Check the first cloud's header and `sequence.json`.
+        """Check `sequence.json`.
 
         Raises:
-            InputError: if they cannot be used.
+            InputError: if it cannot be used.
         """
-        _ = self.name, self.sensor(), self.motion, organised(self.clouds[self.indices[0]])
+        _ = self.name, self.sensor(), self.motion
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -60,27 +71,28 @@ class CloudSequence(AbstractRecording):
         path = self.clouds.get(index)
         if path is None:
             raise self.absent(index)
-        points, colours = _points(path)
-        camera, size = self._camera, (self._camera.height, self._camera.width)
-        if points.shape[:2] != size:
+        cloud = _read(path)
+        camera, size = self.camera, (self.camera.height, self.camera.width)
+        if self.is_organised and cloud.size != (size[1], size[0]):
             raise InputError(
-                f"{path}: has {points.shape[1]} x {points.shape[0]} points where the first cloud has "
+                f"{path}: has {cloud.size[0]} x {cloud.size[1]} points where the first cloud has "
                 f"{size[1]} x {size[0]}; all clouds of a sequence must have one size."
             )
-        z_m = points[..., 2] * (self.unit_mm / 1000.0)
+        points = cloud.points * (_TURNED if self.backward else 1.0)
+        z_m = points[:, 2] * (self.unit_mm / 1000.0)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            columns = np.rint(points[..., 0] / points[..., 2] * camera.fx + camera.cx)
-            rows = np.rint(points[..., 1] / points[..., 2] * camera.fy + camera.cy)
+            columns = np.rint(points[:, 0] / points[:, 2] * camera.fx + camera.cx)
+            rows = np.rint(points[:, 1] / points[:, 2] * camera.fy + camera.cy)
             seen = (z_m > 0.0) & (columns >= 0) & (columns < size[1]) & (rows >= 0) & (rows < size[0])
-        where = rows[seen].astype(np.intp), columns[seen].astype(np.intp)
-        depth_m = np.full(size, np.inf)
-        np.minimum.at(depth_m, where, z_m[seen])
+        far_first = np.flatnonzero(seen)[np.argsort(-z_m[seen], kind="stable")]
+        where = rows[far_first].astype(np.intp), columns[far_first].astype(np.intp)
+        depth_m = np.full(size, np.nan, dtype=np.float32)
+        depth_m[where] = z_m[far_first]
         colour = None
-        if colours is not None:
+        if cloud.colours is not None:
             colour = np.zeros((*size, 3), np.uint8)
-            colour[where] = colours[seen]
-        depth = np.where(np.isinf(depth_m), np.nan, depth_m).astype(np.float32)
-        return Frame(index, float(index), depth, camera, None, colour)
+            colour[where] = cloud.colours[far_first]
+        return Frame(index, float(index), depth_m, camera, None, colour)
 
     def truth(self) -> dict[int, Array] | None:
         """Return None: clouds have no ground truth."""
@@ -90,44 +102,188 @@ class CloudSequence(AbstractRecording):
     def layout(self) -> str:
         """Format of the sequence."""
         kinds = sorted({path.suffix.lower()[1:].upper() for path in self.clouds.values()})
-        return f"organised clouds ({', '.join(kinds)})"
+        return f"{'organised clouds' if self.is_organised else 'clouds'} ({', '.join(kinds)})"
 
     @property
     def depth_unit(self) -> str:
         """Unit of the coordinates."""
-        return "m (the coordinates)" if self.unit_mm == 1000.0 else f"{self.unit_mm:g} mm (--depth-scale-mm)"
+        return f"{'m' if self.unit_mm == 1000.0 else f'{self.unit_mm:g} mm'} ({self.unit_source})"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Where the intrinsics come from."""
-        return () if self.given is not None else ("intrinsics are fitted to the points of the first cloud",)
+        """Where the camera comes from, and what is assumed of the axes."""
+        return self.remarks
 
-    @cached_property
-    def _camera(self) -> Camera:
-        path = self.clouds[self.indices[0]]
-        points, _ = _points(path)
-        intrinsics = fit_intrinsics(points, path) if self.given is None else self.given
-        return Camera(points.shape[1], points.shape[0], *intrinsics)
+
+_TURNED = np.array([1.0, -1.0, -1.0])
 
 
 def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
-    """Open a folder of organised clouds, or one such file.
+    """Open a folder of clouds, or one such file.
 
     Raises:
-        InputError: if it is not readable as such.
+        InputError: if it is not readable as such, or the camera that saw the points is not known.
     """
     found = list_images(path, SUFFIXES) if path.is_dir() else {path.stem: path}
     numbers = frame_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
     clouds = dict(sorted((numbers[stem], cloud) for stem, cloud in found.items()))
-    unit_mm = 1000.0 if overrides.depth_scale_mm is None else overrides.depth_scale_mm
-    return CloudSequence(path, clouds, unit_mm, overrides.intrinsics)
+    first_path, remarks = next(iter(clouds.values())), []
+    first = _read(first_path)
+    ahead = np.count_nonzero(first.points[:, 2] > _LEAST_Z)
+    backward = bool(np.count_nonzero(first.points[:, 2] < -_LEAST_Z) > _BACKWARD * max(ahead, 1))
+    if backward:
+        remarks.append("y points up and z backward, as viewers have it: both are turned around")
+    unit_mm, who = _unit_mm(first, overrides)
+    intrinsics, columns, rows = overrides.intrinsics, *first.size
+    if rows > 1:
+        if intrinsics is None:
+            points = first.points.reshape(rows, columns, 3) * (_TURNED if backward else 1.0)
+            intrinsics = fit_intrinsics(points, first_path)
+            remarks.append("intrinsics are fitted to the points of the first cloud")
+    else:
+        whole, known = True, find_intrinsics(path, overrides) if path.is_dir() else None
+        intrinsics = known.intrinsics if intrinsics is None and known is not None else intrinsics
+        if intrinsics is None:
+            intrinsics = _on_a_grid(_slopes(first, backward=backward), first_path)
+            whole = False
+            remarks.append("intrinsics are recovered: the points lie on the rays of a grid of pixels")
+        intrinsics, columns, rows = _window(clouds, intrinsics, backward=backward, whole=whole)
+    return CloudSequence(
+        path, clouds, unit_mm, who, Camera(columns, rows, *intrinsics), backward, first.size[1] > 1, tuple(remarks)
+    )
+
+
+_LEAST_Z = 1e-9
+_BACKWARD = 100  # times as many points behind the camera as before it
+_LEAST_MM = 50.0  # median depth: nothing is 50 m away, nor 50 mm
+
+
+def _unit_mm(cloud: _Cloud, overrides: Overrides) -> tuple[float, str]:
+    """Return the millimetres per unit of the coordinates, m or mm by their size, and its source."""
+    if overrides.depth_scale_mm is not None:
+        return overrides.depth_scale_mm, "--depth-scale-mm"
+    measured = np.abs(cloud.points[:, 2])
+    measured = measured[measured > _LEAST_Z]
+    in_mm = measured.size > 0 and float(np.median(measured)) > _LEAST_MM
+    return (1.0, "by the size of the coordinates") if in_mm else (1000.0, "the coordinates")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    """A cloud as stored."""
+
+    points: npt.NDArray[np.float64]
+    """(n, 3) in units of the file, NaN where there is none."""
+    colours: npt.NDArray[np.uint8] | None
+    """(n, 3)."""
+    size: tuple[int, int]
+    """Columns and rows; one row if it is not organised."""
+
+
+def _slopes(cloud: _Cloud, *, backward: bool) -> Array:
+    """Return x/z and y/z (n, 2) of the points before the camera."""
+    points = cloud.points * (_TURNED if backward else 1.0)
+    points = points[points[:, 2] > _LEAST_Z]
+    return points[:, :2] / points[:, 2:]
+
+
+def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
+    """Return the intrinsics of a grid of pixels whose rays points (n, 2) lie on, the principal point but for pixels.
+
+    Raises:
+        InputError: if they lie on none.
+    """
+    (fx, cx), (fy, cy) = _steps(slopes[:, 0]), _steps(slopes[:, 1])
+    if not sane((fx, fy, cx, cy)) or max(fx, fy) > _MAX_ASPECT * min(fx, fy):
+        raise InputError(
+            f"{path}: is not organised as an image of columns and rows, nor do its points lie on the rays of a grid of "
+            "pixels; save the camera's cloud or depth image as it comes, or give --intrinsics FX FY CX CY."
+        )
+    return fx, fy, cx, cy
+
+
+_MAX_ASPECT = 1.5
+_FINEST_PX, _COARSEST_PX = 5000.0, 50.0
+_BINS = 1 << 18
+_ON_GRID = 0.7  # of the largest possible power; of points anywhere it is a few hundredths
+_OFF_GRID_PX = 0.12  # median, 0.25 if they lie anywhere
+
+
+def _steps(slopes: Array) -> tuple[float, float]:
+    """Return the factor and the offset in 0..1 that make whole numbers of slopes (n,); 0, 0 if none do.
+
+    The spectrum of the slopes' histogram has its first line at the factor, and multiples of it follow.
+    """
+    slopes = slopes[np.abs(slopes) < _BINS / (8.0 * _FINEST_PX)]
+    values = np.unique(np.round(slopes, 7))
+    if len(values) < 2:
+        return 0.0, 0.0
+    histogram = np.bincount(np.rint((slopes - values[0]) * 4.0 * _FINEST_PX).astype(np.intp), minlength=_BINS)
+    power = np.abs(np.fft.rfft(histogram, _BINS)) / len(slopes)
+    per_bin = 4.0 * _FINEST_PX / _BINS
+    start, stop = round(_COARSEST_PX / per_bin), round(_FINEST_PX / per_bin)
+    high = np.flatnonzero(power[start:stop] > _ON_GRID)
+    if not high.size:
+        return 0.0, 0.0
+    width = max(1, round(0.5 / ((values[-1] - values[0]) * per_bin)))
+    first = start + int(high[0])
+    factor = (first + int(np.argmax(power[first : first + width + 1]))) * per_bin
+    offset = 0.0
+    for _ in range(4):
+        turns = np.exp(2j * np.pi * slopes * factor).mean()
+        offset = float(-np.angle(turns) / (2.0 * np.pi)) % 1.0
+        whole = np.rint(slopes * factor + offset)
+        (factor, offset), *_ = np.linalg.lstsq(np.stack([slopes, np.ones_like(slopes)], axis=1), whole, rcond=None)
+    off_px = float(np.median(np.abs(slopes * factor + offset - np.rint(slopes * factor + offset))))
+    return (float(factor), float(offset)) if off_px < _OFF_GRID_PX else (0.0, 0.0)
+
+
+def _window(
+    clouds: Mapping[int, Path], intrinsics: Intrinsics, *, backward: bool, whole: bool
+) -> tuple[Intrinsics, int, int]:
+    """Return intrinsics, width and height of an image that holds the points of all clouds.
+
+    Args:
+        clouds: by frame number.
+        intrinsics: of the camera.
+        backward: whether y points up and z backward.
+        whole: whether the principal point is given, so that pixels count from the image's corner.
+
+    Raises:
+        InputError: if a cloud cannot be read, or the image would be too large.
+    """
+    fx, fy, cx, cy = intrinsics
+    lows, highs = [], []
+    for path in clouds.values():
+        slopes = _slopes(_read(path), backward=backward)
+        if len(slopes):
+            pixels = np.rint(slopes * (fx, fy) + (cx, cy))
+            lows.append(pixels.min(axis=0))
+            highs.append(pixels.max(axis=0))
+    if not lows:
+        raise InputError(f"{next(iter(clouds.values()))}: has no points before the camera; z must point forward, in m.")
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    if whole:
+        low, high = np.zeros(2), np.maximum(high, np.rint((2.0 * cx, 2.0 * cy)) - 1)
+    else:  # with the principal point in the middle
+        middle = np.array([cx, cy])
+        reach = np.maximum(high - middle, middle - low)
+        low, high = np.floor(middle - reach), np.ceil(middle + reach)
+    columns, rows = (int(size) for size in high - low + 1)
+    if columns * rows > MAX_PIXELS:
+        raise InputError(
+            f"{next(iter(clouds.values()))}: its points spread over {columns} x {rows} pixels of a camera with fx "
+            f"{fx:g} px; are these points in camera coordinates, and the intrinsics theirs?"
+        )
+    return (fx, fy, cx - float(low[0]), cy - float(low[1])), columns, rows
 
 
 def organised(path: Path) -> tuple[int, int]:
-    """Return the (width, height) of a cloud as its header says.
+    """Return the (width, height) of a cloud as its header says; one row if it is not organised as an image.
 
     Raises:
-        InputError: if it is no cloud or is not organised as an image.
+        InputError: if it is no cloud.
     """
     try:
         with open_regular(path) as file:
@@ -146,19 +302,19 @@ def organised(path: Path) -> tuple[int, int]:
         raise InputError(f"{path}: has no header of a {path.suffix[1:].upper()} file; save it again.")
     sizes = [re.search(pattern, text[: stop.end()]) for pattern in (width, height, count)]
     columns, rows, points = (int(found[1]) if found else 0 for found in sizes)
-    if columns < 2 or rows < 2 or columns * rows != points:
+    if points > MAX_PIXELS:
+        raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million points; thin it out.")
+    if points < 2 or (rows > 1 and columns * rows != points):
         raise InputError(
             f"{path}: is not organised as an image of columns and rows; save the camera's cloud as it comes "
             "(PCD with WIDTH and HEIGHT, PLY with obj_info num_cols and num_rows), or its depth image."
         )
-    if points > MAX_PIXELS:
-        raise InputError(f"{path}: has more than {MAX_PIXELS // 1_000_000} million points; thin it out.")
     least = points // _LZF_RATIO if "binary_compressed" in stop[0] else 2 * points
     if size < stop.end() + least:
         raise InputError(f"{path}: is cut off, or has fewer points than its header says; save it again.")
     if size > stop.end() + _MOST_BYTES * points:
         raise InputError(f"{path}: is larger than the points of its header can be; save it again.")
-    return columns, rows
+    return (columns, rows) if columns > 1 and rows > 1 else (points, 1)
 
 
 _PLY_SIZES = ("num_cols|width|cols", "num_rows|height|rows")
@@ -189,18 +345,18 @@ def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
     return fx, fy, cx, cy
 
 
-def _points(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None]:
-    """Return the points (h, w, 3) of a cloud, NaN where there is none, and their colours (h, w, 3)."""
+def _read(path: Path) -> _Cloud:
+    """Return a cloud as stored."""
     width, height = organised(path)
     with input_errors(path, "cloud", "save it again"):
         with open_regular(path) as file:
             points, colours = (_read_pcd if path.suffix.lower() == ".pcd" else _read_ply)(file)
     if points.shape != (width * height, 3):
         raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it again.")
-    points = np.where(np.isfinite(points) & (np.abs(points) < 1e9), points, np.nan).reshape(height, width, 3)
+    points = np.where(np.isfinite(points) & (np.abs(points) < 1e9), points, np.nan)
     if colours.shape[:1] != (width * height,) or colours.ndim != 2 or colours.shape[1] < 3:
-        return points, None
-    return points, colours[:, :3].astype(np.uint8).reshape(height, width, 3)
+        return _Cloud(points, None, (width, height))
+    return _Cloud(points, colours[:, :3].astype(np.uint8), (width, height))
 
 
 def _read_pcd(file: BinaryIO) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

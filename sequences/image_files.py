@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, final
+from typing import IO, Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -162,7 +162,7 @@ def read_labels(path: Path) -> npt.NDArray[np.uint8]:
     return np.where(occluded, OCCLUDED, np.where(pixels != 0, 255, 0)).astype(np.uint8)
 
 
-def _mask_pixels(path: Path) -> tuple[npt.NDArray[np.generic], bool]:
+def _mask_pixels(path: Path) -> tuple[npt.NDArray[Any], bool]:
     """Return the values of a mask (h, w), of colour the brightest channel, and whether it is stored as 8-bit grey."""
     image = open_image(path, _FORMATS)
     if image.mode in ("LA", "RGBA", "PA"):
@@ -177,7 +177,7 @@ def _mask_pixels(path: Path) -> tuple[npt.NDArray[np.generic], bool]:
 _WHITE, _VEIL, _FEW_LABELS = 192, 16, 8
 
 
-def is_soft(pixels: npt.NDArray[np.generic]) -> bool:
+def is_soft(pixels: npt.NDArray[Any]) -> bool:
     """Return whether a mask (h, w) is graded between black and white, instead of a few labels."""
     if pixels.dtype != np.uint8 or pixels.max(initial=0) < _WHITE:
         return False

@@ -133,9 +133,8 @@ class ImageFolderSequence(AbstractRecording):
             camera = Camera(camera.width, camera.height, *files.intrinsics)
         elif lens.is_distorted:
             depth_m = lens.undistort(depth_m, float("nan"))
-            mask, occluder, colour = (
-                None if image is None else lens.undistort(image) for image in (mask, occluder, colour)
-            )
+            mask, occluder = (None if image is None else lens.undistort(image) for image in (mask, occluder))
+            colour = None if colour is None else lens.undistort(colour)
         return Frame(index, files.time_s, depth_m, camera, mask, colour, occluder)
 
     @property

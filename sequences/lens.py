@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from modeler import se3
 from modeler.types import Array, Camera, InputError
 
-Pixel = TypeVar("Pixel", np.uint8, np.uint16, np.float32)
+Pixel = TypeVar("Pixel", np.bool_, np.uint8, np.uint16, np.float32)
 
 
 @final

@@ -22,6 +22,7 @@ from modeler.sequences.image_folders import (
 from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import SCHEME, open_camera
+from modeler.sequences.ray_distance import AxialSequence
 from modeler.system.regular_files import check_regular
 from modeler.types import InputError
 
@@ -48,7 +49,8 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
     if str(path).startswith(SCHEME):
         return open_camera(str(path).removeprefix(SCHEME), overrides)
     try:
-        return with_hand(_open(path, overrides))
+        found = with_hand(_open(path, overrides))
+        return AxialSequence(found) if overrides.along_ray else found
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
 
@@ -69,6 +71,9 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
         check_regular(path)
     elif overrides.strict_paths:
         check_links(path)
+    recorded = [entry for entry in entries(path) if entry.suffix.lower() in BAGS] if path.is_dir() else []
+    if len(recorded) == 1 and not is_there(path / "metadata.yaml"):  # which a recorder that crashed does not write
+        path = recorded[0]
     if path.suffix.lower() in BAGS or is_there(path / "metadata.yaml"):
         from modeler.sequences.ros.sequence import open_ros
 

@@ -8,6 +8,8 @@ from typing import final
 import numpy as np
 
 from modeler.sequences.base import AbstractSequence, span
+from modeler.sequences.colour_alignment import Misalignment, misalignment
+from modeler.sequences.ray_distance import flat_shares
 from modeler.types import Camera, Frame, InputError
 
 NEAREST_M = 0.01
@@ -28,6 +30,12 @@ WIDEST_FIELD_DEG = 170.0
 """No pinhole camera sees more."""
 MAX_ASPECT = 1.5
 """Pixels are nearly square."""
+BENT = 1.5
+"""Ratio of the shares on a plane from which depth is the distance along the ray: 2 to 6 in scenes with a table."""
+LEAST_FLAT = 0.15
+"""Least share of the pixels that such a plane has."""
+INSPECTED = 6
+"""Number of frames, spread over the sequence, whose planes and edges are looked at."""
 LEAST_JOINED = 0.3
 """Depth cameras measure whole areas; where fewer pixels have measured neighbours, it is lines or single points."""
 
@@ -63,6 +71,10 @@ class Survey:
     """Number of frames with colour."""
     truths: int | None
     """Number of frames with a true pose; None if not checked."""
+    flat: tuple[float, float] = (0.0, 0.0)
+    """Shares (0..1) of the pixels on the largest plane if depth is along the optical axis, and if along the ray."""
+    misaligned: Misalignment | None = None
+    """Where colour is instead of where depth is; None if it is aligned, or edges do not tell."""
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -83,9 +95,34 @@ class Survey:
         return tuple(lacks)
 
     @property
+    def plain_errors(self) -> tuple[str, ...]:
+        """What depth or colour plainly are not, in words."""
+        axis, ray = self.flat
+        found = []
+        if ray > max(LEAST_FLAT, BENT * axis):
+            found.append(
+                f"depth is the distance along the ray, as renderers write it: so {ray:.0%} of it lie on one plane, "
+                f"along the optical axis {axis:.0%}; give --along-ray"
+            )
+        elif self.misaligned is not None and self.misaligned.is_sure:
+            found.append(_on_colour(self.misaligned))
+        return tuple(found)
+
+    def check(self, name: str, *, despite_doubts: bool = False) -> None:
+        """Refuse a sequence with a plain error, unless asked not to.
+
+        Raises:
+            InputError: if it has one.
+        """
+        if self.plain_errors and not despite_doubts:
+            raise InputError(f"{name}: {self.plain_errors[0]} (or --despite-doubts)")
+
+    @property
     def doubts(self) -> tuple[str, ...]:
-        """Likely errors, in words."""
-        middle_m, doubts = self.range_m[1], []
+        """Likely errors, in words, in order of importance."""
+        middle_m, doubts = self.range_m[1], [*self.plain_errors]
+        if self.misaligned is not None and not self.misaligned.is_sure:
+            doubts.append(_on_colour(self.misaligned))
         if not LIKELY_M[0] <= middle_m <= LIKELY_M[1]:
             what = "near" if middle_m < LIKELY_M[0] else "far"
             doubts.append(
@@ -141,8 +178,11 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
     cameras: dict[Camera, None] = {}
     times_s, ranges, shares, joined, farthest_m = [], [], [], [], 0.0
     empty, empty_masks, repeated, masks, colours = [], [], [], 0, 0
-    before_m = None
-    for frame in sequence:
+    before_m, inspected = None, []
+    every = max(1, (len(sequence) - 1) // (INSPECTED - 1))
+    for place, frame in enumerate(sequence):
+        if place % every == 0 and len(inspected) < INSPECTED:
+            inspected.append(frame)
         if frame.camera not in cameras:
             cameras[_checked(sequence, frame.camera)] = None
         times_s.append(frame.time_s)
@@ -185,6 +225,8 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         empty_masks=tuple(empty_masks),
         colours=colours,
         truths=(0 if poses is None else len(poses)) if truth else None,
+        flat=flat_shares(inspected),
+        misaligned=misalignment([frame for frame in inspected if frame.camera == inspected[0].camera]),
     )
 
 
@@ -228,6 +270,13 @@ def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
     raise InputError(
         f"{sequence.name}: half of the depth lies within {middle_m:.3g} m where one unit is {sequence.depth_unit}: "
         f"it looks like {guess}; correct the depth scale{factor}, or convert with --depth-scale-mm."
+    )
+
+
+def _on_colour(found: Misalignment) -> str:
+    return (
+        f"colour {found} against depth, by the edges in {INSPECTED} frames: is it of another camera, resized or "
+        "mirrored? Give colour that is aligned to depth, or move it away to do without"
     )
 
 

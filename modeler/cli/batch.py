@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from modeler.cli.console import bar, say
-from modeler.cli.options import FrameOptions, ModelOptions, as_arguments
+from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, as_arguments
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ class Batch:
     method: MethodOptions = field(default_factory=MethodOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)
     where: ObjectOptions = field(default_factory=ObjectOptions)
+    given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
         """Build the remaining sequences, and list all.
@@ -125,7 +126,7 @@ def _jobs(options: Batch) -> list[Job]:
     from modeler.cli.manifest import Row, named, read_manifest
     from modeler.types import InputError
 
-    groups = (options.model, options.prior, options.method, options.selection, options.where)
+    groups = (options.model, options.prior, options.method, options.selection, options.where, options.given)
     common = tuple(word for group in groups for word in as_arguments(group))
     rows = [Row(path, f"{path}") for path in options.sequences]
     if options.manifest is not None:

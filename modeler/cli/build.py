@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from modeler.cli.console import Console, Interrupt, say
-from modeler.cli.options import MIN_VOXEL_M, FrameOptions, ModelOptions
+from modeler.cli.options import MIN_VOXEL_M, FrameOptions, InputOptions, ModelOptions
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
 
@@ -61,6 +61,7 @@ class Build:
     method: MethodOptions = field(default_factory=MethodOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)
     where: ObjectOptions = field(default_factory=ObjectOptions)
+    given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
         """Run the loop into a run folder; status 3 if the model cannot be trusted; report.json has the reasons.
@@ -114,6 +115,7 @@ class Build:
         parts["voxel_m"] = self.model.voxel_m
         files = {"sensor": self.model.sensor, "camera": self.model.camera}
         parts |= {name: None if path is None else str(path.absolute()) for name, path in files.items()}
+        parts |= self.given.settings()
         return {
             name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())
         }
@@ -132,6 +134,8 @@ class Build:
             words = {name: value for name, value in words.items() if name.replace("-", "_") not in vars(self.prior)}
         if words.pop("colour", None) is not None:
             words["no-colour"] = ""  # a flag
+        if "along-ray" in words:
+            words["along-ray"] = ""
         options = " ".join(f"--{name} {value}".rstrip() for name, value in {**words, **changes}.items())
         return (
             f"modeler build {shlex.quote(str(self.sequence))} --out {shlex.quote(str(self.out))} --overwrite {options}"
@@ -164,16 +168,17 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     """
     from modeler.cli.reading import watched
     from modeler.runs.reopening import calibrated
-    from modeler.sequences import KeptSequence, Overrides, frame_range, open_sequence, survey
+    from modeler.sequences import KeptSequence, frame_range, open_sequence, survey
     from modeler.types import InputError
 
-    path, overrides = options.sequence, Overrides(strict_paths=options.model.strict_paths)
+    path, overrides = options.sequence, options.given.overrides()
     whole = watched(path, overrides, options.idle_s) if options.watch else open_sequence(path, overrides)
     whole = whole if whole.live else KeptSequence(whole)
     whole = calibrated(whole, options.model.sensor, options.model.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     if not frames.live:
         found = survey(frames, truth=False)
+        found.check(frames.name, despite_doubts=options.given.despite_doubts)
         if options.method.method == "coloured-icp" and found.colours == 0:
             raise InputError(f"{path}: has no colour, which coloured ICP compares; give another --method")
         for doubt in found.doubts:

@@ -72,6 +72,7 @@ class Convert:
             )
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
+            found.check(sequence.name, despite_doubts=self.given.despite_doubts)
             farthest_m = LIVE_REACH_M if sequence.live else found.farthest_m
             unit_mm = finest_unit_mm(farthest_m)
             write_bop(

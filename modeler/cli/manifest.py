@@ -13,13 +13,14 @@ from functools import cache
 from pathlib import Path
 
 from modeler.batch.jobs import NOTES, read_note
-from modeler.cli.options import FrameOptions, ModelOptions, as_arguments
+from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, as_arguments
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import InputError
 
-_GROUPS = (ModelOptions, PriorOptions, MethodOptions, FrameOptions, ObjectOptions)
+_GROUPS = (ModelOptions, PriorOptions, MethodOptions, FrameOptions, ObjectOptions, InputOptions)
 _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
-_FLAGS = {"colour": ("--no-colour", _NO), "strict-paths": ("--strict-paths", _YES)}  # and the answers that give them
+_FLAGS = {"colour": ("--no-colour", _NO)}  # and the answers that give them
+_FLAGS |= {name: (f"--{name}", _YES) for name in ("strict-paths", "along-ray", "despite-doubts")}
 _LONGEST = 100  # characters of a name; with an ending, a file system takes 255 bytes
 
 

@@ -48,7 +48,6 @@ class ModelOptions:
     """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from the data")] = None
     """Side of a voxel of the model."""
-    strict_paths: StrictPaths = False
 
 
 @dataclass(frozen=True)
@@ -99,6 +98,10 @@ class InputOptions:
     """Topic of the depth images in a ROS bag."""
     colour_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC"), default("the one aligned to depth")] = None
     """Topic of the colour images in a ROS bag."""
+    along_ray: bool = False
+    """Stored depth is the distance along the ray, as renderers write it, not along the optical axis."""
+    despite_doubts: bool = False
+    """Use the input although depth or colour are plainly not what they seem (`modeler info` says why)."""
     strict_paths: StrictPaths = False
 
     def overrides(self) -> Overrides:
@@ -109,4 +112,9 @@ class InputOptions:
         """
         from modeler.sequences import Overrides
 
-        return Overrides(**asdict(self))
+        return Overrides(**{name: value for name, value in asdict(self).items() if name != "despite_doubts"})
+
+    def settings(self) -> dict[str, object]:
+        """Return what was given, as recorded in report.json."""
+        unrecorded = ("despite_doubts", "strict_paths")
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) and f.name not in unrecorded}

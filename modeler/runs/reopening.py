@@ -20,6 +20,7 @@ from modeler.segmentation import Scene
 from modeler.sequences import (
     AbstractSequence,
     CalibratedSequence,
+    Overrides,
     RefocusedSequence,
     open_sequence,
     read_focal_factor,
@@ -156,7 +157,15 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
     if not where.exists():
         raise InputError(f"{where}: the sequence of {run} does not exist; give its new place with --sequence")
     sensor, camera = (Path(settings[name]) if name in settings else None for name in ("sensor", "camera"))
-    return (Part(run, report, calibrated(open_sequence(where), sensor, camera)),)
+    return (Part(run, report, calibrated(open_sequence(where, _overrides(settings)), sensor, camera)),)
+
+
+def _overrides(settings: Mapping[str, Any]) -> Overrides:
+    """Return what was given in place of the input's own values, of the settings of a run."""
+    given: dict[str, Any] = {one.name: settings[one.name] for one in fields(Overrides) if one.name in settings}
+    if "intrinsics" in given:
+        given["intrinsics"] = tuple(given["intrinsics"])
+    return Overrides(**given)
 
 
 def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | None) -> AbstractSequence:

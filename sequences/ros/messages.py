@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from modeler.sequences.depth_files import read_depth
+from modeler.sequences.depth_files import metres, read_depth
 from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour
 from modeler.sequences.intrinsics import sane
 from modeler.sequences.lens import Lens, lens_of_model
@@ -63,9 +64,47 @@ def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]
         raw = _rows(message, 2, where).view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
     elif "32FC1" in message.format:
         raise InputError(f"{where}: holds packed 32FC1 depth, which is lossy; record the raw topic or 16UC1.")
+    elif message.format.rstrip().endswith("rvl"):
+        raw = from_rvl(bytes(message.data[_PACKED_DEPTH_HEADER:]), where)
     else:
         raw = read_depth(EmbeddedImage(bytes(message.data[_PACKED_DEPTH_HEADER:]), where))
-    return np.where(raw == 0, np.float32(np.nan), (raw * (unit_mm / 1000.0)).astype(np.float32))
+    return metres(raw, unit_mm)
+
+
+def from_rvl(data: bytes, where: str) -> npt.NDArray[np.uint16]:
+    """Return depth (h, w) of an image packed by RVL (Wilson 2017), with its width and height before it.
+
+    Numbers are of digits of three bits, lowest first, in groups of four bits, the highest of which says that more
+    follow. They are the lengths of runs without and with depth in turn, and after the second the differences along it,
+    with their sign in the lowest bit.
+
+    Raises:
+        InputError: if it is cut off, or is too large.
+    """
+    width, height = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
+    if not 0 < width * height <= MAX_PIXELS:
+        raise InputError(f"{where}: an image has {width} x {height} pixels; record it again.")
+    words = np.frombuffer(data, "<u4", offset=8, count=(len(data) - 8) // 4)
+    groups = ((words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32)) & 15).ravel().astype(np.int64)
+    last = np.flatnonzero(groups < 8)
+    first = np.concatenate([[0], last[:-1] + 1])
+    place = np.arange(int(last[-1]) + 1 if last.size else 0) - np.repeat(first, last - first + 1)
+    digits = (groups[: place.size] & 7) << np.minimum(3 * place, 60)
+    numbers = np.add.reduceat(digits, first) if last.size else digits
+    result, at, pixel, before = np.zeros(width * height, np.int64), 0, 0, 0
+    while pixel < result.size:
+        if at + 1 >= len(numbers):
+            raise InputError(f"{where}: an image packed by RVL is cut off; record it again.")
+        empty, filled = int(numbers[at]), int(numbers[at + 1])
+        pixel, at = pixel + empty, at + 2
+        if pixel + filled > result.size or at + filled > len(numbers) or empty + filled == 0:
+            raise InputError(f"{where}: an image packed by RVL is cut off or broken; record it again.")
+        steps = numbers[at : at + filled]
+        values = before + np.cumsum((steps >> 1) ^ -(steps & 1))
+        result[pixel : pixel + filled] = values
+        before = int(values[-1]) if filled else before
+        pixel, at = pixel + filled, at + filled
+    return (result & 0xFFFF).astype(np.uint16).reshape(height, width)
 
 
 def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:

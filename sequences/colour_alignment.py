@@ -1,0 +1,188 @@
+"""Whether colour shows what depth shows: edges of depth are looked for in colour, mirrored, scaled and shifted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from modeler.types import Array, Frame
+
+_WIDTH: Final = 160  # px to which images are shrunk
+_REACH: Final = 0.2  # of the width: largest shift
+_SCALES: Final = np.exp(0.05 * np.arange(-7, 8))
+_ASPECTS: Final = (1.0, 0.75, 0.866, 1.155, 1.333)  # of 4 : 3, 3 : 2 and 16 : 9 in each other
+_EDGE: Final = 0.03  # relative second difference of inverse depth, which is linear over planes
+_LEAST_EDGES: Final = 12.0  # px at that size, mean over the frames
+
+
+@final
+@dataclass(frozen=True)
+class Misalignment:
+    """Where edges of depth are found in colour, if not where they are."""
+
+    mirrored: bool
+    """Whether colour is mirrored left to right."""
+    scale: tuple[float, float]
+    """Size of things in colour relative to depth, across and down."""
+    shift_px: tuple[float, float]
+    """Shift of colour against depth at the middle of the image, right and down, in px of the images."""
+    support: float
+    """Correlation of edges there, in standard deviations over all shifts."""
+    support_aligned: float
+    """Correlation of edges if colour is aligned, in standard deviations over all shifts."""
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether alignment is out of the question: as good as anywhere, where it is plain elsewhere."""
+        return self.support > _PLAIN and self.support_aligned < _NO_BETTER
+
+    def __str__(self) -> str:
+        across, down = self.scale
+        parts = ["is mirrored"] * self.mirrored
+        if max(abs(np.log(self.scale))) > 0.02:
+            size = f"{across:.2f}" if across == down else f"{across:.2f} across and {down:.2f} down"
+            parts.append(f"shows things {size} times as large")
+        if max(map(abs, self.shift_px)) >= 1.0:
+            parts.append(f"is shifted by about ({self.shift_px[0]:.0f}, {self.shift_px[1]:.0f}) px")
+        return " and ".join(parts)
+
+
+_PLAIN, _NO_BETTER = 4.5, 3.0  # standard deviations
+_HIDDEN: Final = 4.5  # standard deviations above which alignment is not doubted but for a shift
+_BETTER: Final = 2.0  # ratio of correlations from which another place than alignment is believed
+_SHIFTED: Final = 1.3  # the same where alignment is not plainly wrong
+_SIMPLER: Final = 0.8  # share of the best correlation with which a simpler explanation does
+_LEAST_SHIFT: Final = 2  # px at that size
+
+
+def misalignment(frames: Sequence[Frame]) -> Misalignment | None:
+    """Return where colour is instead of where depth is; None if it is aligned, or edges do not tell.
+
+    Args:
+        frames: some of a sequence, of one camera.
+    """
+    pairs = [_edges(frame, frame.colour) for frame in frames if frame.colour is not None]
+    if not pairs or np.mean([depth.sum() for depth, _ in pairs]) < _LEAST_EDGES:
+        return None
+    still = _Search(pairs).correlation(mirrored=False, scale=(1.0, 1.0))
+    deviation, centre = float(still.std()), still.shape[0] // 2
+    if deviation == 0.0:
+        return None
+    aligned = float(still[centre - 1 : centre + 2, centre - 1 : centre + 2].max())
+    shifted = _best(still, mirrored=False, scale=(1.0, 1.0))
+    if aligned > _HIDDEN * deviation:
+        plain = shifted.height > _SHIFTED * aligned and max(map(abs, shifted.shift)) > _LEAST_SHIFT
+        return _result(frames[0], shifted, aligned / deviation) if plain else None
+    search = _Search(pairs)
+    tried = [
+        _best(search.correlation(mirrored=mirrored, scale=scale), mirrored=mirrored, scale=scale)
+        for mirrored in (False, True)
+        for scale in _scales()
+    ]
+    best = max(tried, key=lambda each: each.height)
+    if best.height < _BETTER * aligned or best.height < _PLAIN * best.deviation:
+        return None
+    simple = sorted((each for each in tried if each.height >= _SIMPLER * best.height), key=lambda each: each.steps)
+    chosen = max((each for each in simple if each.steps == simple[0].steps), key=lambda each: each.height)
+    return _result(frames[0], chosen, aligned / deviation)
+
+
+@final
+@dataclass(frozen=True)
+class _Peak:
+    """The best shift of one mirroring and scale."""
+
+    height: float
+    deviation: float
+    shift: tuple[int, int]
+    mirrored: bool
+    scale: tuple[float, float]
+
+    @property
+    def steps(self) -> int:
+        """How complicated an explanation it is."""
+        across, down = self.scale
+        return self.mirrored + (self.scale != (1.0, 1.0)) + (across != down)
+
+
+def _best(correlation: Array, *, mirrored: bool, scale: tuple[float, float]) -> _Peak:
+    reach = correlation.shape[0] // 2
+    row, column = np.unravel_index(int(correlation.argmax()), correlation.shape)
+    shift = int(column) - reach, int(row) - reach
+    return _Peak(float(correlation.max()), float(correlation.std()), shift, mirrored, scale)
+
+
+def _result(frame: Frame, peak: _Peak, aligned: float) -> Misalignment:
+    step = _step(frame.depth_m.shape[1])
+    shift_px = float(step * peak.shift[0]), float(step * peak.shift[1])
+    return Misalignment(peak.mirrored, peak.scale, shift_px, peak.height / peak.deviation, aligned)
+
+
+def _scales() -> Iterator[tuple[float, float]]:
+    for aspect in _ASPECTS:
+        for scale in _SCALES:
+            yield round(float(scale * np.sqrt(aspect)), 3), round(float(scale / np.sqrt(aspect)), 3)
+
+
+def _step(width: int) -> int:
+    return max(1, width // _WIDTH)
+
+
+def _edges(frame: Frame, colour: npt.NDArray[np.uint8]) -> tuple[Array, Array]:
+    """Return the edges of depth and of colour, shrunk; those of colour less their surroundings' mean."""
+    inverse = 1.0 / np.where(frame.depth_m > 0.0, frame.depth_m, np.nan).astype(np.float64)
+    bends = np.zeros(inverse.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        bent = np.abs(np.roll(inverse, 1, axis) + np.roll(inverse, -1, axis) - 2.0 * inverse)
+        with np.errstate(invalid="ignore"):
+            bends |= bent > _EDGE * inverse
+    bends[[0, -1]] = bends[:, [0, -1]] = False  # rolled around
+    slope = np.zeros(colour.shape[:2])
+    for channel in range(3):
+        smooth = ndimage.gaussian_filter(colour[..., channel].astype(np.float64), 1.0)
+        slope = np.maximum(slope, np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1)))
+    steep = slope / (slope + np.percentile(slope, 80.0) + 1e-9)
+    step = _step(frame.depth_m.shape[1])
+    seen = _shrunk(steep, step)
+    return np.minimum(_shrunk(bends.astype(np.float64), step), 0.5), seen - np.asarray(ndimage.gaussian_filter(seen, 8))
+
+
+def _shrunk(image: Array, step: int) -> Array:
+    height, width = (size // step for size in image.shape)
+    return image[: height * step, : width * step].reshape(height, step, width, step).mean(axis=(1, 3))
+
+
+@final
+class _Search:
+    """Correlation of edges of depth and colour over shifts, summed over frames."""
+
+    def __init__(self, pairs: Sequence[tuple[Array, Array]]) -> None:
+        height, width = pairs[0][0].shape
+        self._size = 2 * height, 2 * width
+        self._depth = [depth for depth, _ in pairs]
+        self._colour = [np.fft.rfft2(colour, self._size) for _, colour in pairs]
+        self._norm = float(np.sqrt(np.mean([np.mean(colour**2) for _, colour in pairs]))) + 1e-12
+
+    def correlation(self, *, mirrored: bool, scale: tuple[float, float]) -> Array:
+        """Return the correlation by shift, down and right, from minus to plus the reach."""
+        total, count = np.zeros(self._size), 1.0
+        for depth, colour in zip(self._depth, self._colour, strict=True):
+            flipped = depth[:, ::-1] if mirrored else depth
+            moved = flipped if scale == (1.0, 1.0) else self._resized(flipped, scale)
+            total += np.fft.irfft2(np.conj(np.fft.rfft2(moved, self._size)) * colour, self._size)
+            count += float(moved.sum())
+        reach = round(_REACH * self._depth[0].shape[1])
+        return np.roll(total, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1] / (count * self._norm)
+
+    def _resized(self, image: Array, scale: tuple[float, float]) -> Array:
+        """Return an image (h, w) with things of another size, by interpolation, about its middle."""
+        sources = [
+            (np.arange(size) - (size - 1) / 2) / factor + (size - 1) / 2
+            for size, factor in zip(image.shape, scale[::-1], strict=True)
+        ]
+        return np.asarray(ndimage.map_coordinates(image, np.meshgrid(*sources, indexing="ij"), order=1))

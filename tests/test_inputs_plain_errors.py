@@ -1,0 +1,147 @@
+"""Inputs that are plainly not what they seem are refused in one line, and used on request."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from modeler.cli import main
+from modeler.sequences import Overrides, Survey, bundled, open_sequence, survey, write_bop
+from modeler.sequences.ray_distance import AxialSequence, stretch
+from modeler.sequences.ros.messages import from_rvl
+from modeler.types import Camera, Frame, InputError
+from studies.formats.image_folders import raw_depth, save
+
+CAMERA = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
+
+
+def colour_as(colour: np.ndarray, *, mirrored: bool, scale: float, shift_px: tuple[float, float]) -> np.ndarray:
+    """Return colour as another camera, or another program, shows it."""
+    image = Image.fromarray(colour[:, ::-1] if mirrored else colour)
+    (width, height), (x, y) = image.size, shift_px
+    across, down = width / 2 * (1 - 1 / scale) - x / scale, height / 2 * (1 - 1 / scale) - y / scale
+    return np.asarray(image.transform(image.size, Image.Transform.AFFINE, (1 / scale, 0, across, 0, 1 / scale, down)))
+
+
+def cards(
+    folder: Path, *, mirrored: bool = False, scale: float = 1.0, shift_px: tuple[float, float] = (0.0, 0.0)
+) -> Survey:
+    """Return the survey of cards of one colour each before a wall, other ones in every frame."""
+    rng, frames = np.random.default_rng(3), []
+    for index in range(6):
+        depth_m = np.full((240, 320), 1.5, np.float32)
+        colour = np.full((240, 320, 3), 90, np.uint8)
+        for _ in range(5):
+            row, column, height, width = rng.integers((20, 20, 20, 20), (180, 250, 60, 70))
+            depth_m[row : row + height, column : column + width] = rng.uniform(0.7, 1.2)
+            colour[row : row + height, column : column + width] = rng.integers(0, 256, 3)
+        seen = colour_as(colour, mirrored=mirrored, scale=scale, shift_px=shift_px)
+        frames.append(Frame(index, float(index), depth_m, CAMERA, None, seen))
+    write_bop(folder, frames)
+    return survey(open_sequence(folder))
+
+
+def test_aligned_colour_is_believed(tmp_path: Path) -> None:
+    assert cards(tmp_path / "s").misaligned is None
+
+
+def test_mirrored_colour_is_told(tmp_path: Path) -> None:
+    found = cards(tmp_path / "s", mirrored=True)
+    assert found.misaligned is not None
+    assert found.misaligned.mirrored
+    assert found.doubts[0].startswith("colour is mirrored")
+
+
+def test_shifted_colour_is_told_by_how_much(tmp_path: Path) -> None:
+    found = cards(tmp_path / "s", shift_px=(20.0, -12.0))
+    assert found.misaligned is not None
+    assert not found.misaligned.mirrored
+    assert found.misaligned.scale == (1.0, 1.0)
+    assert found.misaligned.shift_px == pytest.approx((20.0, -12.0), abs=2.0)
+    with pytest.raises(InputError, match="colour is shifted by about"):
+        found.check("cards")
+    found.check("cards", despite_doubts=True)
+
+
+def test_colour_of_another_lens_is_told(tmp_path: Path) -> None:
+    found = cards(tmp_path / "s", scale=1.25, shift_px=(-12.0, 0.0))
+    assert found.misaligned is not None
+    assert found.misaligned.scale == pytest.approx((1.25, 1.25), abs=0.05)
+    assert found.misaligned.shift_px == pytest.approx((-12.0, 0.0), abs=4.0)
+
+
+def test_distance_along_the_ray_is_told_and_mended(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    whole = open_sequence(bundled("box"))
+    camera = whole.frame(0).camera
+    for index in whole.indices[:3]:
+        frame = whole.frame(index)
+        bent = replace(frame, depth_m=(frame.depth_m * stretch(camera)).astype(np.float32))
+        save(tmp_path / "s" / "depth" / f"{index}.png", raw_depth(bent, 0.1))
+    facts = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "depth_scale": 0.1}
+    (tmp_path / "s" / "camera.json").write_text(json.dumps(facts))
+    assert main(["convert", str(tmp_path / "s"), "--out", str(tmp_path / "bop")]) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1
+    assert "distance along the ray" in said
+    assert "--along-ray" in said
+    assert main(["convert", str(tmp_path / "s"), "--out", str(tmp_path / "bop"), "--along-ray"]) == 0
+    for read, wrote in zip(open_sequence(tmp_path / "bop"), whole, strict=False):
+        np.testing.assert_allclose(read.depth_m, wrote.depth_m, atol=2e-4)
+    mended = open_sequence(tmp_path / "s", Overrides(along_ray=True))
+    assert isinstance(mended, AxialSequence)
+    assert not survey(mended).doubts
+    assert not survey(whole.select(frames=slice(0, 3))).plain_errors
+
+
+def packed(image: np.ndarray) -> bytes:
+    """Pack depth by RVL, number by number, as Wilson's program does."""
+    values, groups, at, before = image.ravel().astype(int).tolist(), [], 0, 0
+
+    def put(number: int) -> None:
+        while True:
+            more = number >> 3
+            groups.append((number & 7) | (8 if more else 0))
+            if not more:
+                return
+            number = more
+
+    while at < len(values):
+        empty = at
+        while at < len(values) and values[at] == 0:
+            at += 1
+        filled = at
+        while at < len(values) and values[at] != 0:
+            at += 1
+        put(filled - empty)
+        put(at - filled)
+        for value in values[filled:at]:
+            step, before = value - before, value
+            put((step << 1) ^ (step >> 31))
+    groups += [0] * (-len(groups) % 8)
+    words = [
+        sum(group << (28 - 4 * place) for place, group in enumerate(groups[start : start + 8]))
+        for start in range(0, len(groups), 8)
+    ]
+    return struct.pack(f"<II{len(words)}I", image.shape[1], image.shape[0], *words)
+
+
+def test_images_packed_by_rvl_are_read(frames: list[Frame], rng: np.random.Generator) -> None:
+    for image in (
+        raw_depth(frames[0], 1.0),
+        rng.integers(0, 65536, (7, 5)).astype(np.uint16),
+        np.zeros((3, 4), np.uint16),
+        (rng.random((40, 50)) < 0.5).astype(np.uint16) * 900,
+    ):
+        data = packed(image)
+        np.testing.assert_array_equal(from_rvl(data, "bag"), image)
+        if image.any():
+            with pytest.raises(InputError, match="cut off"):
+                from_rvl(data[: 8 + (len(data) - 8) // 8 * 4], "bag")
+    with pytest.raises(InputError, match="has 0 x 0 pixels"):
+        from_rvl(b"", "bag")
