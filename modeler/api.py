@@ -121,7 +121,7 @@ def build(
     Args:
         sequence: a path in any format that `modeler build` reads, or an open sequence, with frames selected or not.
         out: the run folder to create: mesh, cloud, trajectory, graph, report and recording.
-        prior: of the motion between frames, or its name as in `--prior`; None: that of the sequence, else `auto`.
+        prior: of the motion between frames, or its name in `modeler build`; None: that of the sequence, else `auto`.
         seed: of every random number; the same seed gives the same model.
         overwrite: replace the results of an earlier run in the folder.
 

@@ -122,7 +122,7 @@ class AbstractSequence(ABC):
         if not kept:
             wanted = f"{'' if start is None else start}:{'' if stop is None else stop}"
             raise InputError(
-                f"--frames {wanted} leaves nothing of sequence {self.name!r}; its frames are {span(self.indices)}."
+                f"`frames` {wanted} leaves nothing of sequence {self.name!r}; its frames are {span(self.indices)}."
             )
         return self if kept == self.indices else SelectedSequence(self, kept)
 
@@ -272,7 +272,7 @@ def check_every(every: int) -> None:
         InputError: if it is less than 1.
     """
     if every < 1:
-        raise InputError(f"--every {every} keeps no frame; give a whole number of at least 1.")
+        raise InputError(f"`every` {every} keeps no frame; give a whole number of at least 1.")
 
 
 def frame_range(text: str) -> slice:
@@ -283,7 +283,7 @@ def frame_range(text: str) -> slice:
     """
     match = re.fullmatch(r"([0-9]*):([0-9]*)", text.strip())
     if match is None:
-        raise InputError(f"--frames {text!r} is not a range of frame numbers; write A:B, for instance 0:14.")
+        raise InputError(f"`frames` {text!r} is not a range of frame numbers; write A:B, for instance 0:14.")
     start, stop = (int(end) if end else None for end in match.groups())
     return slice(start, stop)
 

@@ -165,7 +165,7 @@ class BopSequence(AbstractRecording):
     def depth_unit(self) -> str:
         """Unit of stored depth."""
         scales = sorted({scale for _, scale in self._intrinsics.values()})
-        source = "scene_camera.json" if self.overrides.depth_scale_mm is None else "--depth-scale-mm"
+        source = "scene_camera.json" if self.overrides.depth_scale_mm is None else "`depth_scale_mm`"
         return f"{' or '.join(f'{scale:g}' for scale in scales[:3])} mm ({source})"
 
     @property
@@ -324,7 +324,7 @@ def write_bop(
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists already; remove it or give another --out.")
+        raise InputError(f"{folder}: exists already; remove it or give another `out`.")
     partial = folder.parent / f".{folder.name}.{os.getpid()}.partial"
     try:
         for left in left_behind(folder, ".partial"):

@@ -161,7 +161,7 @@ _LEAST_MM = 50.0  # median depth: nothing is 50 m away, nor 50 mm
 def _unit_mm(cloud: _Cloud, overrides: Overrides) -> tuple[float, str]:
     """Return the millimetres per unit of the coordinates, m or mm by their size, and its source."""
     if overrides.depth_scale_mm is not None:
-        return overrides.depth_scale_mm, "--depth-scale-mm"
+        return overrides.depth_scale_mm, "`depth_scale_mm`"
     measured = np.abs(cloud.points[:, 2])
     measured = measured[measured > _LEAST_Z]
     in_mm = measured.size > 0 and float(np.median(measured)) > _LEAST_MM
@@ -198,7 +198,7 @@ def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
     if not sane((fx, fy, cx, cy)) or max(fx, fy) > _MAX_ASPECT * min(fx, fy):
         raise InputError(
             f"{path}: is not organised as an image of columns and rows, nor do its points lie on the rays of a grid of "
-            "pixels; save the camera's cloud or depth image as it comes, or give --intrinsics FX FY CX CY."
+            "pixels; save the camera's cloud or depth image as it comes, or give `intrinsics` FX FY CX CY."
         )
     return fx, fy, cx, cy
 
@@ -340,7 +340,7 @@ def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
     if max(off_px) > MAX_OFF_PX or not sane((fx, fy, cx, cy)):
         raise InputError(
             f"{path}: its points are not on the rays of a pinhole camera (off by {max(off_px):.1f} px); save them in "
-            "camera coordinates (x right, y down, z forward), or give --intrinsics FX FY CX CY."
+            "camera coordinates (x right, y down, z forward), or give `intrinsics` FX FY CX CY."
         )
     return fx, fy, cx, cy
 

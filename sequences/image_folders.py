@@ -222,7 +222,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
         if (width, height) != (640, 480):
             raise InputError(
                 f"{path}: no intrinsics for images of {width} x {height}; write `fx fy cx cy` into calibration.txt "
-                "there, or convert with --intrinsics FX FY CX CY."
+                "there, or convert with `intrinsics` FX FY CX CY."
             )
         found = CameraFacts(CALIBRATION, "the benchmark")
         remarks.append("no intrinsics: the benchmark's default of 525 525 319.5 239.5 px is assumed")
@@ -417,7 +417,7 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
     if facts is None:
         raise InputError(
             f"{path}: no intrinsics; add camera.json with fx, fy, cx and cy in px, cam_K.txt (three rows of K), "
-            "camera_intrinsic.json (Open3D's) or scene_camera.json (BOP's), or convert with --intrinsics FX FY CX CY."
+            "camera_intrinsic.json (Open3D's) or scene_camera.json (BOP's), or convert with `intrinsics` FX FY CX CY."
         )
     facts = facts.scaled(size)
     numbers = frame_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}

@@ -45,11 +45,11 @@ class Overrides:
         if self.intrinsics is not None and not sane(self.intrinsics):
             shown = " ".join(f"{value:g}" for value in self.intrinsics)
             raise InputError(
-                f"--intrinsics {shown} are those of no camera; give FX FY CX CY in px, FX and FY from 1 to 1e6."
+                f"`intrinsics` {shown} are those of no camera; give FX FY CX CY in px, FX and FY from 1 to 1e6."
             )
         if self.depth_scale_mm is not None and not 1e-6 <= self.depth_scale_mm <= 1e3:
             raise InputError(
-                f"--depth-scale-mm {self.depth_scale_mm:g} is out of range; give the millimetres in one unit of depth."
+                f"`depth_scale_mm` {self.depth_scale_mm:g} is out of range; give the millimetres in one unit of depth."
             )
 
 
@@ -135,7 +135,7 @@ class CameraFacts:
             usual: the default and its source.
         """
         if overrides.depth_scale_mm is not None:
-            return overrides.depth_scale_mm, "--depth-scale-mm"
+            return overrides.depth_scale_mm, "`depth_scale_mm`"
         return usual if self.unit_mm is None else (self.unit_mm, self.by)
 
     def doubts(self, size: tuple[int, int]) -> list[str]:
@@ -159,7 +159,7 @@ def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
         InputError: if a file of intrinsics cannot be read.
     """
     if overrides.intrinsics is not None:
-        return CameraFacts(overrides.intrinsics, "--intrinsics")
+        return CameraFacts(overrides.intrinsics, "`intrinsics`")
     named = [folder / name for name in NAMES]
     others = [path for path in entries(folder) if path.suffix.lower() in (".yaml", ".yml") and path.name[0] != "."]
     for path in [*named, *others]:

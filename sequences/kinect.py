@@ -46,7 +46,7 @@ def depth_lens(calibration: Node, size: Size, intrinsics: Intrinsics | None) -> 
     if size not in _DEPTH_MODES:
         raise InputError(
             f"{calibration.path}: depth of {size[0]} x {size[1]} pixels is of no mode of the Azure Kinect; "
-            "convert with --intrinsics FX FY CX CY."
+            "convert with `intrinsics` FX FY CX CY."
         )
     return _lens(calibration, DEPTH, size, *_DEPTH_MODES[size])
 
@@ -149,7 +149,7 @@ class KinectSequence(AbstractStreams[int]):
     @property
     def depth_unit(self) -> str:
         """Unit of stored depth."""
-        return f"{self.unit_mm:g} mm ({'of the format' if self.unit_mm == 1.0 else '--depth-scale-mm'})"
+        return f"{self.unit_mm:g} mm ({'of the format' if self.unit_mm == 1.0 else '`depth_scale_mm`'})"
 
 
 def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:

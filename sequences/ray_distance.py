@@ -31,7 +31,7 @@ class AxialSequence(AbstractDerived):
     @property
     def notes(self) -> tuple[str, ...]:
         """Assumptions and omissions of the reader."""
-        return (*self.whole.notes, "depth is taken for the distance along the ray (--along-ray)")
+        return (*self.whole.notes, "depth is taken for the distance along the ray (`along_ray`)")
 
 
 _POINTS: Final = 4000

@@ -102,7 +102,7 @@ class Survey:
         if ray > max(LEAST_FLAT, BENT * axis):
             found.append(
                 f"depth is the distance along the ray, as renderers write it: so {ray:.0%} of it lie on one plane, "
-                f"along the optical axis {axis:.0%}; give --along-ray"
+                f"along the optical axis {axis:.0%}; give `along_ray`"
             )
         elif self.misaligned is not None and self.misaligned.is_sure:
             found.append(_on_colour(self.misaligned))
@@ -115,7 +115,7 @@ class Survey:
             InputError: if it has one.
         """
         if self.plain_errors and not despite_doubts:
-            raise InputError(f"{name}: {self.plain_errors[0]} (or --despite-doubts)")
+            raise InputError(f"{name}: {self.plain_errors[0]} (or `despite_doubts`)")
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -127,7 +127,7 @@ class Survey:
             what = "near" if middle_m < LIKELY_M[0] else "far"
             doubts.append(
                 f"half of the depth lies within {middle_m:.2f} m, very {what} for an object: is the unit right? "
-                "If not, convert with --depth-scale-mm"
+                "If not, convert with `depth_scale_mm`"
             )
         for camera in self.cameras:
             fields_deg = (field_of_view_deg(camera.width, camera.fx), field_of_view_deg(camera.height, camera.fy))
@@ -245,7 +245,7 @@ def _checked(sequence: AbstractSequence, camera: Camera) -> Camera:
         if field_of_view_deg(size_px, focal_px) > WIDEST_FIELD_DEG:
             raise InputError(
                 f"{sequence.name}: {name} of {focal_px:g} px is no focal length for images of {camera.width} x "
-                f"{camera.height}; correct the intrinsics, which are in px, or convert with --intrinsics FX FY CX CY."
+                f"{camera.height}; correct the intrinsics, which are in px, or convert with `intrinsics` FX FY CX CY."
             )
     return camera
 
@@ -269,7 +269,7 @@ def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
     factor = " (1000 times the present scale)" if in_metres else " (a thousandth of it)" if in_millimetres else ""
     raise InputError(
         f"{sequence.name}: half of the depth lies within {middle_m:.3g} m where one unit is {sequence.depth_unit}: "
-        f"it looks like {guess}; correct the depth scale{factor}, or convert with --depth-scale-mm."
+        f"it looks like {guess}; correct the depth scale{factor}, or convert with `depth_scale_mm`."
     )
 
 

@@ -34,36 +34,36 @@ def untrusted(
 @pytest.mark.parametrize(
     ("report", "prior", "options"),
     [
-        (untrusted("unsure_masks", "seen_through"), priors.GeneralPrior(), {"roi", "max-depth-m"}),
-        (untrusted("no_motion"), priors.GeneralPrior(), {"roi", "max-depth-m"}),
+        (untrusted("unsure_masks", "seen_through"), priors.GeneralPrior(), {"roi", "max_depth_m"}),
+        (untrusted("no_motion"), priors.GeneralPrior(), {"roi", "max_depth_m"}),
         (untrusted("seen_through", up=[0.0, -1.0, 0.0], turn_deg=25.0), priors.GeneralPrior(), {"prior": "table"}),
         (
             untrusted("seen_through", up=[0.0, -1.0, 0.0], turn_deg=48.0),
             priors.GeneralPrior(),
-            {"prior": "table", "max-rotation-deg": "100"},
+            {"prior": "table", "max_rotation_deg": "100"},
         ),
-        (untrusted("seen_through"), priors.GeneralPrior(), {"prior": "turntable", "step-deg": "40"}),
+        (untrusted("seen_through"), priors.GeneralPrior(), {"prior": "turntable", "step_deg": "40"}),
         (untrusted("unsure_rotation", up=[0.0, -1.0, 0.0]), priors.TablePrior(), {"prior": "turntable"}),
         (
             untrusted("unsure_rotation", sigma_deg=15.0),
             priors.GeneralPrior(),
-            {"prior": "turntable", "step-deg": "DEG"},
+            {"prior": "turntable", "step_deg": "DEG"},
         ),
         (untrusted("unsure_rotation"), priors.TurntablePrior(25.0), None),
         (untrusted("unsure_focal"), priors.TablePrior(), {"camera": "camera.json"}),
-        (untrusted("prior_contradicted"), priors.TurntablePrior(25.0, 2.0), {"step-sigma-deg": "6"}),
+        (untrusted("prior_contradicted"), priors.TurntablePrior(25.0, 2.0), {"step_sigma_deg": "6"}),
         (untrusted("prior_contradicted"), priors.TablePrior(), {"prior": "general"}),
         (untrusted("never_came_back"), priors.GeneralPrior(), None),
         (
             untrusted("left_out", turn_deg=48.0, outcome=Outcome.AT_LIMIT),
             priors.GeneralPrior(),
-            {"max-rotation-deg": "100"},
+            {"max_rotation_deg": "100"},
         ),
-        (untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT), priors.TablePrior(), {"max-shift-m": "0.1"}),
+        (untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT), priors.TablePrior(), {"max_shift_m": "0.1"}),
         (
             untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT),
             priors.GeneralPrior(),
-            {"max-offset-m": "0.08"},
+            {"max_offset_m": "0.08"},
         ),
         (untrusted("left_out", outcome=Outcome.NO_OVERLAP), priors.GeneralPrior(), None),
     ],
@@ -76,10 +76,10 @@ def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
         assert every == []
     else:
         (found,) = every
-        assert set(options) <= set(found.options)
-        assert ("max-rotation-deg" in found.options) is ("max-rotation-deg" in options)
+        assert set(options) <= set(found.parameters)
+        assert ("max_rotation_deg" in found.parameters) is ("max_rotation_deg" in options)
         if isinstance(options, dict):
-            assert options.items() <= found.options.items()
+            assert options.items() <= found.parameters.items()
 
 
 @pytest.mark.parametrize(
@@ -104,14 +104,14 @@ def test_surface_that_is_not_there_leads_to_the_masks_where_a_loop_confirms_the_
     report = untrusted("seen_through", "absent", closed=closed, up=[0.0, -1.0, 0.0])
     (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith(first)
-    assert bool(found.options) is not closed
+    assert bool(found.parameters) is not closed
 
 
 def test_a_size_that_is_not_known_has_a_remedy_of_its_own() -> None:
     report = untrusted("absent", "unsure_size", closed=True)
     masks, size = remedies(report, priors.GeneralPrior())
     assert masks.first.startswith("modeler report")
-    assert "--known focal-length" in size.first
+    assert "`known` focal-length" in size.first
     assert [one.first for one in remedies(untrusted("unsure_size"), priors.GeneralPrior())] == [size.first]
 
 
@@ -120,7 +120,7 @@ def test_a_loop_that_is_open_leads_to_the_focal_length() -> None:
     report["edges"].append(report["edges"][0] | {"kind": "closure"})
     (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith("modeler calibrate-camera")
-    assert found.options == {"camera": "camera.json"}
+    assert found.parameters == {"camera": "camera.json"}
 
 
 def test_the_command_to_try_keeps_what_was_given() -> None:
@@ -141,4 +141,4 @@ def test_a_hand_in_half_of_the_frames_does_not_make_the_others_superfluous() -> 
         return [{"id": k, **(nothing if k < 4 else {"cause": "", "mask": of_the_others.label})} for k in range(8)]
 
     assert visible_frames(told(Outcome.UNSURE_MASK)) == ""
-    assert "--frames 4:" in visible_frames(told(Outcome.CONVERGED))
+    assert "`frames` 4:" in visible_frames(told(Outcome.CONVERGED))

@@ -363,7 +363,7 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
 
     prior = priors.TurntablePrior(-30.0, 2.0)
     said = measured_step(steps(15.0), prior)
-    assert [words for words in ("15.0°", "30° ± 2°", "--step-deg -15.0") if words not in said] == []
+    assert [words for words in ("15.0°", "30° ± 2°", "`step_deg` -15.0") if words not in said] == []
     assert "turned by 15.0°" in measured_step(steps(45.0, gap=3), prior)
     again = [edge | {"source": edge["target"], "target": edge["source"]} for edge in steps(-29.0)[:1]]
     assert measured_step(steps(29.0) + again, prior) == ""  # a frame that was tried again lies before its target
@@ -374,7 +374,7 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
     assert measured_step(steps(15.0), priors.TablePrior()) == ""
     still = measured_step(steps(0.02), prior)
     assert "turned by 0.0°" in still
-    assert "--step-deg" not in still  # which refuses 0
+    assert "`step_deg`" not in still  # which refuses 0
     assert "turned by 15.0°" in measured_step(steps(15.0), priors.ProductPrior(priors.GeneralPrior(), prior))
 
 
@@ -384,9 +384,9 @@ def test_frames_before_the_object_came_are_told() -> None:
     def said(*outcomes: str) -> str:
         return visible_frames([{"id": 2 * place, "cause": cause} for place, cause in enumerate(outcomes)])
 
-    assert "--frames 4: " in said(few, few, ACCEPTED, lost, ACCEPTED)
-    assert "--frames :7 " in said(ACCEPTED, few, lost, ACCEPTED, few)
-    assert "--frames 2:5 " in said(few, ACCEPTED, ACCEPTED, few)
+    assert "`frames` 4: " in said(few, few, ACCEPTED, lost, ACCEPTED)
+    assert "`frames` :7 " in said(ACCEPTED, few, lost, ACCEPTED, few)
+    assert "`frames` 2:5 " in said(few, ACCEPTED, ACCEPTED, few)
     for whole in ((ACCEPTED, few, ACCEPTED), (lost, ACCEPTED, lost), (few, few, few), (few, ACCEPTED), ()):
         assert said(*whole) == ""
 

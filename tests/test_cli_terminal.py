@@ -22,7 +22,7 @@ import pytest
 from command_runner import BOX, QUICK
 
 from modeler.cli import main
-from modeler.cli.console import Console, Interrupt
+from modeler.cli.console import Console, Interrupt, as_options
 from modeler.cli.info import Info
 from modeler.cli.reading import reading
 from modeler.composition.compose import check_region
@@ -33,6 +33,12 @@ from modeler.verdict.advice import outcome_advice
 
 COMMAND = [sys.executable, "-m", "modeler"]
 FEW = Outcome.TOO_FEW_POINTS
+
+
+def test_parameters_that_a_message_names_are_printed_as_options() -> None:
+    """Those of commands and of groups of options; other words in backticks stay as they are."""
+    assert as_options("give `roi` and `max_depth_m`: `purpose` print") == "give --roi and --max-depth-m: --for print"
+    assert as_options("write `fx fy cx cy`, run `modeler`") == "write `fx fy cx cy`, run `modeler`"
 
 
 def test_a_watched_sequence_is_the_same_sequence() -> None:
@@ -77,7 +83,8 @@ def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixt
     unsure = Outcome.UNSURE_MASK
     refusals = [PriorRefused(f"frames {frame} and 2 show no plane; show it") for frame in (3, 4)]
     said = told(enumerate([Failed(FEW), Failed(FEW), Failed(unsure), *refusals]), capfd)
-    assert [(outcome_advice(FEW) in line, outcome_advice(unsure) in line, "show it" in line) for line in said] == [
+    few, doubtful = (as_options(outcome_advice(outcome)) for outcome in (FEW, unsure))
+    assert [(few in line, doubtful in line, "show it" in line) for line in said] == [
         (True, False, False), (False, False, False), (False, True, False), (False, False, True), (False, False, False)
     ]  # fmt: skip
     assert [words in line for words, line in zip((FEW.label, FEW.label, unsure.label), said, strict=False)] == [
@@ -120,7 +127,7 @@ def on_a_terminal(command: list[str]) -> str:
 
 WATCHED = """
 from modeler.composition.compose import check_region
-from modeler.cli.console import Console, Interrupt
+from modeler.cli.console import Console, Interrupt, as_options
 from modeler.types import Fusing, Refining, Searching
 with Console(25, None) as console:
     for event in {}: console(event)

@@ -287,7 +287,7 @@ def test_a_closed_turn_is_judged_by_what_all_its_steps_leave(known: bool) -> Non
 @pytest.mark.parametrize("pairing", [Pairing(), Pairing(closed=True, both_ways=True), Pairing((1, 2), closed=True)])
 def test_only_steps_once_round_are_a_loop(pairing: Pairing) -> None:
     assert not pairing.loops
-    with pytest.raises(InputError, match="--closed"):
+    with pytest.raises(InputError, match="`closed`"):
         experiment(pairing=pairing).size(Recording(known=False))
 
 
@@ -341,7 +341,7 @@ def test_refuses_two_sequences_of_one_name(tmp_path: Path) -> None:
 
 def test_refuses_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="--out"):
+    with pytest.raises(InputError, match="`out`"):
         run(tmp_path / "file" / "out")
 
 

@@ -107,7 +107,7 @@ def test_points_off_a_grid_need_intrinsics(tmp_path: Path, frames: list[Frame], 
     points = seen_points(frames[0], rng)
     points[:, :2] += rng.uniform(-3e-3, 3e-3, (len(points), 2))
     write_points(tmp_path / "0.ply", points)
-    with pytest.raises(InputError, match=r"nor do its points lie on the rays of a grid.*--intrinsics"):
+    with pytest.raises(InputError, match=r"nor do its points lie on the rays of a grid.*`intrinsics`"):
         open_sequence(tmp_path)
     given = Overrides(intrinsics=OFF_CENTRE)
     read = open_sequence(tmp_path, given).frame(0)

@@ -29,7 +29,7 @@ def test_what_a_person_says_counts_more(folder: Path) -> None:
     for first, second in zip(plain, sequence, strict=True):
         np.testing.assert_allclose(second.depth_m, first.depth_m * np.float32(0.4 / unit), rtol=1e-6)
         assert (second.camera.fx, second.camera.fy, second.camera.cx, second.camera.cy) == (100.0, 101.0, 80.0, 60.0)
-    assert sequence.depth_unit == "0.4 mm (--depth-scale-mm)"
+    assert sequence.depth_unit == "0.4 mm (`depth_scale_mm`)"
 
 
 def test_the_benchmarks_own_size_needs_no_intrinsics(tmp_path: Path, frames: list[Frame]) -> None:

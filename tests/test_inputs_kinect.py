@@ -139,7 +139,7 @@ def test_a_recording_without_colour_is_read_and_converted(tmp_path: Path) -> Non
     assert len(open_sequence(tmp_path / "bop")) == 3
     given = open_sequence(tmp_path / "s.mkv", Overrides(intrinsics=(250.0, 250.0, 160.0, 144.0), depth_scale_mm=0.5))
     assert given.frame(0).camera.fx == 250.0
-    assert given.depth_unit == "0.5 mm (--depth-scale-mm)"
+    assert given.depth_unit == "0.5 mm (`depth_scale_mm`)"
 
 
 @pytest.mark.parametrize(

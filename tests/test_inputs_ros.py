@@ -135,7 +135,7 @@ def test_several_depth_topics_need_a_choice(tmp_path: Path, frames: list[Frame])
     assert open_sequence(path).frame(0).colour is not None
     both = tmp_path / "both.bag"
     Two("16UC1", "32FC1", names=named("/a/depth_one", "/a/depth_two")).write(both, frames)
-    with pytest.raises(InputError, match=r"/a/depth_one, /a/depth_two.*--depth-topic"):
+    with pytest.raises(InputError, match=r"/a/depth_one, /a/depth_two.*`depth_topic`"):
         open_sequence(both)
     assert "topic /a/depth_two" in open_sequence(both, Overrides(depth_topic="/a/depth_two")).layout
     with pytest.raises(InputError, match="/c holds no depth images"):

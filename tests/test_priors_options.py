@@ -182,28 +182,28 @@ def test_pokes_are_read() -> None:
         (PriorOptions(prior="magic"), None, "unknown prior 'magic'"),
         (PriorOptions(prior="table+"), None, "unknown prior ''"),
         (PriorOptions(prior="velocity+velocity"), None, "names velocity twice"),
-        (PriorOptions(prior="turntable"), None, "give --step-deg"),
+        (PriorOptions(prior="turntable"), None, "give `step_deg`"),
         (PriorOptions(prior="held"), None, "one sequence at a time"),
         (PriorOptions(prior="held"), TURNTABLE, "telling: has no robot.txt"),
         (PriorOptions(prior="poke"), TURNTABLE, "give them"),
-        (PriorOptions(prior="poke", poke_length_m=0.1), None, "--poke-point-m as well"),
+        (PriorOptions(prior="poke", poke_length_m=0.1), None, "`poke_point_m` as well"),
         (
             PriorOptions(prior="table", step_deg=3.0),
             None,
-            "--step-deg is not a parameter of --prior table",
+            "`step_deg` is not a parameter of `prior` table",
         ),
-        (PriorOptions(prior="table+turntable", max_rotation_deg=3.0), TURNTABLE, "--max-rotation-deg"),
-        (PriorOptions(prior="turntable", step_deg=float("nan")), None, "--step-deg nan is out of range"),
+        (PriorOptions(prior="table+turntable", max_rotation_deg=3.0), TURNTABLE, "`max_rotation_deg`"),
+        (PriorOptions(prior="turntable", step_deg=float("nan")), None, "`step_deg` nan is out of range"),
         (
             PriorOptions(prior="turntable", step_deg=5.0, axis_point_m=(0, 0, float("inf"))),
             None,
-            "--axis-point-m 0 0 inf",
+            "`axis_point_m` 0 0 inf",
         ),
-        (PriorOptions(prior="held", held_sigma_m=-0.1), TURNTABLE, "--held-sigma-m -0.1 is out of range"),
+        (PriorOptions(prior="held", held_sigma_m=-0.1), TURNTABLE, "`held_sigma_m` -0.1 is out of range"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"one": POKE}}), "poke 'one'"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"9" * 5000: POKE}}), "must have a frame number"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": POKE | {"length_m": 10**400}}}), "poke '1' must be"),
-        (PriorOptions(prior="turntable"), Telling({"kind": "turntable", "step_deg": 10**400}), "give --step-deg"),
+        (PriorOptions(prior="turntable"), Telling({"kind": "turntable", "step_deg": 10**400}), "give `step_deg`"),
         (PriorOptions(), Telling({"kind": "turntable", "step_deg": 1e308}), "telling: sequence.json: step_deg 1e+308"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": POKE | {"length_m": 7.0}}}), "length_m 7 is out of"),
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": {"point_m": [0, 0]}}}), "poke '1' must be"),
@@ -248,11 +248,11 @@ def test_a_prior_of_the_users_own_is_used_with_its_fields() -> None:
         ("own_priors:Choosy", (), "never"),
         ("own_priors:Slow", ("speed=3",), "has axis, max_turn_deg"),
         ("own_priors:Slow", ("axis",), "NAME=VALUE"),
-        ("table", ("axis=1",), "--prior-args"),
+        ("table", ("axis=1",), "`prior_args`"),
     ],
 )
 def test_what_is_no_prior_is_said_in_one_line(prior: str, arguments: tuple[str, ...], says: str) -> None:
-    with refused("--prior", says):
+    with refused("`prior", says):
         chosen_prior(PriorOptions(prior=prior, prior_args=arguments), TURNTABLE)
 
 

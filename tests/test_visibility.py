@@ -69,7 +69,7 @@ def test_a_motion_beyond_the_prior_is_not_passed_off_as_one_within(flashlight, r
     assert not posterior.usable
     (beyond,) = posterior.beyond
     assert np.degrees(se3.rotation_angle(beyond)) == pytest.approx(24.0, abs=3.0)
-    assert "--max-rotation-deg 24" in outcome_advice(posterior.outcome, prior, posterior)
+    assert "`max_rotation_deg` 24" in outcome_advice(posterior.outcome, prior, posterior)
 
 
 def test_surfaces_that_share_nothing_do_not_overlap(flashlight, rng):

@@ -250,7 +250,7 @@ def test_a_stream_to_nowhere_takes_steps(run: list[Step]) -> None:
 
 @pytest.mark.parametrize("address", ["localhost", "http://127.0.0.1:9876", "rerun+http://127.0.0.1:x/proxy"])
 def test_a_wrong_address_is_refused(address: str) -> None:
-    with pytest.raises(viewer.InputError, match=r"--connect .*rerun\+http://127\.0\.0\.1:9876/proxy"):
+    with pytest.raises(viewer.InputError, match=r"`connect` .*rerun\+http://127\.0\.0\.1:9876/proxy"):
         open_stream("box", save=None, connect=address)
 
 
@@ -265,7 +265,7 @@ def test_a_recording_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 def test_viewing_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(viewer.InputError, match=r"no recording\.rrd .*build --out"):
+    with pytest.raises(viewer.InputError, match=r"no recording\.rrd .*modeler build"):
         viewer.view(tmp_path)
 
 

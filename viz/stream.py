@@ -197,7 +197,7 @@ def open_stream(
     if listens:
         sinks.append(rr.GrpcSink(connect))
     elif connect is not None:
-        _log.warning("--connect %s: no viewer listens there; the run goes on without it", connect)
+        _log.warning("`connect` %s: no viewer listens there; the run goes on without it", connect)
     # Rerun keeps metadata of every piece that it writes in memory: 0.4 MB a frame, if each frame is written by itself.
     pieces = rr.ChunkBatcherConfig(flush_tick=_BATCH_S)
     same = uuid.uuid4()  # for viewers, in which the file is opened later

@@ -89,7 +89,7 @@ def start_window(recordings: Sequence[Path] = ()) -> Viewer:
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
-            "cannot open the viewer: no display (DISPLAY is not set); use --web and open the page that it prints"
+            "cannot open the viewer: no display (DISPLAY is not set); use `web` and open the page that it prints"
         )
     port = _free_port()
     sink = _sink(port)
@@ -126,7 +126,7 @@ def view(run: Path, *, web: bool = False) -> Viewer:
     """
     recording = run / "recording.rrd"
     if not os.path.lexists(recording):
-        raise InputError(f"{run}: no recording.rrd here; give the folder that `modeler build --out` made")
+        raise InputError(f"{run}: no recording.rrd here; give a run folder of `modeler build`")
     check_regular(recording)
     return start_web(recording) if web else start_window([recording])
 
@@ -141,7 +141,7 @@ def reachable(sink: str) -> bool:
     place, _, path = rest.partition("/")
     host, _, port = place.rpartition(":")
     if scheme not in ("rerun", "rerun+http", "rerun+https") or path != "proxy" or not host or not port.isdigit():
-        raise InputError(f"--connect {sink}: not the address of a viewer; give one like {_sink(9876)}")
+        raise InputError(f"`connect` {sink}: not the address of a viewer; give one like {_sink(9876)}")
     return _listens(host.strip("[]"), int(port), patience_s=1.0)
 
 

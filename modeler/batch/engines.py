@@ -53,11 +53,11 @@ def check_engine(name: str) -> None:
     kind, _, what = name.partition(":")
     if name != "processes" and not what:
         raise InputError(
-            f"--executor {name} is unknown; give processes, dask:ADDRESS, slurm:FOLDER, or module:callable for your own"
+            f"`executor` {name} is unknown; give processes, dask:ADDRESS, slurm:FOLDER, or module:callable for your own"
         )
     package = {"dask": "distributed", "slurm": "submitit"}.get(kind)
     if package is not None and importlib.util.find_spec(package) is None:
-        raise InputError(f"--executor {name}: {package} is not installed; pip install '.[{kind}]'")
+        raise InputError(f"`executor` {name}: {package} is not installed; pip install '.[{kind}]'")
 
 
 def is_here(name: str) -> bool:
@@ -109,7 +109,7 @@ def _dask(address: str) -> Iterator[Executor]:
         distributed.comm.get_address_host(address)  # a client that was begun with nonsense would linger
         client = distributed.Client(address, timeout=_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
-        raise InputError(f"--executor dask:{address}: no scheduler answers there ({error}); start one") from None
+        raise InputError(f"`executor` dask:{address}: no scheduler answers there ({error}); start one") from None
     try:
         yield client.get_executor(pure=False)  # a job that is tried again is no result that is known
     finally:
@@ -170,8 +170,8 @@ def _own(name: str, module: str, attribute: str, workers: int | None) -> Executo
         executor = getattr(importlib.import_module(module), attribute)(workers)
     except Exception as error:  # whatever a user's module raises
         raise InputError(
-            f"--executor {name}: cannot be created ({type(error).__name__}: {error}); correct it"
+            f"`executor` {name}: cannot be created ({type(error).__name__}: {error}); correct it"
         ) from error
     if not isinstance(executor, Executor):
-        raise InputError(f"--executor {name}: returns no concurrent.futures.Executor; derive it from that class")
+        raise InputError(f"`executor` {name}: returns no concurrent.futures.Executor; derive it from that class")
     return executor

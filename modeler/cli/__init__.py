@@ -24,7 +24,7 @@ import tyro
 from modeler.cli.batch import Batch
 from modeler.cli.build import Build
 from modeler.cli.calibrate import CalibrateCamera, CalibrateSensor
-from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable
+from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable, worded_as_options
 from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
@@ -94,6 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_standard_streams()
     share_one_heap()
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
+    for handler in logging.root.handlers:
+        handler.addFilter(worded_as_options)
     logging.raiseExceptions = False  # stderr may be full
     # Rerun logs a closed viewer, which is no error, and a full disk; we report what matters.
     os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off,re_log_encoding=off")

@@ -121,7 +121,8 @@ class Build:
         }
 
     def command(self, changes: Mapping[str, str]) -> str:
-        """Return the command line that replaces the run by one with other options, by name without dashes."""
+        """Return the command line that replaces the run by one with other parameters."""
+        changes = {name.replace("_", "-"): value for name, value in changes.items()}
         given = {"prior": self.prior.prior, **self.settings(), "seed": self.method.seed}
         given |= {name: getattr(self.model, name) for name in ("sensor", "camera")}  # paths as given
         usual = {"every": 1, "frames": ":", "method": "visibility", "colour": True, "seed": 0}
@@ -321,6 +322,6 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
             say(remark)
     for next_step in [] if report["trustworthy"] else remedies(report, prior):
         commands = [next_step.first.format(run=shlex.quote(str(options.out)))] if next_step.first else []
-        commands += [options.command(next_step.options)] if next_step.options else []
+        commands += [options.command(next_step.parameters)] if next_step.parameters else []
         say(f"{next_step.words}: {' && '.join(commands)}")
     return 0 if report["trustworthy"] else 3

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from functools import cache
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -28,9 +32,35 @@ _ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
 def say(words: str) -> None:
     """Print a one-line message; unprintable characters from inputs are escaped."""
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(words.split()))
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(as_options(words).split()))
     with lost_without_harm():
         print("modeler:", line, file=sys.stderr)
+
+
+def as_options(words: str) -> str:
+    """Return a message with the parameters that it names in backticks, such as `max_depth_m`, as options."""
+    options = _options()
+    return re.sub(r"`(\w+)`", lambda found: options.get(found[1], found[0]), words)
+
+
+@cache
+def _options() -> dict[str, str]:
+    """Return the options of all commands by the names of their parameters."""
+    from modeler.cli import COMMANDS
+
+    groups, names = list[Any](COMMANDS.values()), set[str]()
+    while groups:
+        for field in fields(groups.pop()):
+            names.add(field.name)
+            if is_dataclass(field.default_factory):
+                groups.append(field.default_factory)
+    return {name: f"--{name.replace('_', '-')}" for name in names} | {"purpose": "--for"}
+
+
+def worded_as_options(record: logging.LogRecord) -> bool:
+    """Put options for parameters in a record of the log; a filter that lets all pass."""
+    record.msg, record.args = as_options(record.getMessage()), ()
+    return True
 
 
 @contextlib.contextmanager
@@ -277,4 +307,4 @@ class Console:
 
     def _say(self, text: str) -> None:
         with lost_without_harm():
-            self._bar.console.print(f"modeler: {text}", markup=False)
+            self._bar.console.print(f"modeler: {as_options(text)}", markup=False)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from modeler.cli.console import as_options
 from modeler.cli.options import InputOptions
 
 if TYPE_CHECKING:
@@ -43,9 +44,9 @@ class Info:
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
         if self.json:
-            print(dumps(record(sequence, found), allow_nan=False))
+            print(as_options(dumps(record(sequence, found), allow_nan=False)))
         else:
-            print("\n".join(f"{what:14}{said}" for what, said in rows(sequence, found)))
+            print(as_options("\n".join(f"{what:14}{said}" for what, said in rows(sequence, found))))
         return 0
 
 

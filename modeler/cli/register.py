@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from modeler.cli.console import say
+from modeler.cli.console import as_options, say
 from modeler.cli.options import StrictPaths
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.runs.compiling import compile_kernels
@@ -56,7 +56,7 @@ class Register:
             views.append(prepared.view)
         posterior = modeler.register(*views).widened(modeler.sensor.sigma_focal)
         what_to_do = outcome_advice(posterior.outcome, modeler.prior, posterior)
-        edge = Edge(posterior, "odometry", posterior.usable, Stated(what_to_do))
+        edge = Edge(posterior, "odometry", posterior.usable, Stated(as_options(what_to_do)))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
         print(json.dumps(record, allow_nan=False))
         _, remark = compose.resolved_prior(self.prior, sequence)

@@ -95,7 +95,7 @@ def check_region(where: ObjectOptions, sequence: AbstractSequence) -> None:
     camera = sequence.frame(sequence.indices[0]).camera
     if where.roi[2] > camera.width or where.roi[3] > camera.height:
         raise InputError(
-            f"--roi {' '.join(map(str, where.roi))} reaches outside the images of {sequence.name}, which are "
+            f"`roi` {' '.join(map(str, where.roi))} reaches outside the images of {sequence.name}, which are "
             f"{camera.width} x {camera.height} pixels; give X1 up to {camera.width} and Y1 up to {camera.height}"
         )
 
@@ -125,9 +125,9 @@ def registrar(
     """
     if device == "cuda":
         if method != "paper":
-            raise InputError(f"--device cuda: --method {method} runs on the CPU only; leave --device out")
+            raise InputError(f"`device` cuda: `method` {method} runs on the CPU only; leave `device` out")
         if (fault := gpu.missing()) is not None:
-            raise InputError(f"--device cuda: {fault}")
+            raise InputError(f"`device` cuda: {fault}")
     match method:
         case "visibility":
             return registration.VisibilityRegistrar(registration.VisibilityLikelihood(colour=colour))
@@ -145,7 +145,7 @@ def registrar(
             return registration.FpfhIcpRegistrar()
         case "kiss":
             if not kiss.installed():
-                raise InputError(f"--method kiss: {kiss.MISSING}")
+                raise InputError(f"`method` kiss: {kiss.MISSING}")
             return registration.KissIcpRegistrar()
 
 
@@ -164,22 +164,22 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
     for part in parts:
         if part not in _GIVEN and ":" not in part:
             raise InputError(
-                f"--prior {name}: unknown prior {part!r}; known are {', '.join(map(repr, _GIVEN))}, "
+                f"`prior` {name}: unknown prior {part!r}; known are {', '.join(map(repr, _GIVEN))}, "
                 "your own as module:Class, and several joined by +"
             )
         if parts.count(part) > 1:
-            raise InputError(f"--prior {name} names {part} twice; name each once")
+            raise InputError(f"`prior` {name} names {part} twice; name each once")
     known = [part for part in parts if part not in _GUESSES] or ["general"]
     own = sum(part not in _GIVEN for part in known)
     if own > 1 or (options.prior_args and not own):
-        raise InputError("--prior-args are the fields of one prior of your own; give --prior module:Class once")
+        raise InputError("`prior_args` are the fields of one prior of your own; give `prior` module:Class once")
     accepted = {parameter for part in (*parts, *known) for parameter in _GIVEN.get(part, ())}
     given = options.given(name, accepted, _GIVEN)
     of = {part: {key: value for key, value in given.items() if key in _GIVEN[part]} for part in _GIVEN}
     if {"table", "turntable"} <= set(known):  # the axis is the table's normal: to multiply would count the table twice
         if "max_rotation_deg" in given:
             raise InputError(
-                "--max-rotation-deg is not a parameter of a turntable on its table; --step-deg gives the rotation."
+                "`max_rotation_deg` is not a parameter of a turntable on its table; `step_deg` gives the rotation."
             )
         known.remove("table")
         of["turntable"]["needs_table"] = True
@@ -287,17 +287,17 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
     try:
         kind = getattr(importlib.import_module(module_name), class_name)
     except Exception as error:  # whatever a user's module raises
-        raise InputError(f"--prior {name}: cannot be imported ({type(error).__name__}: {error}); correct it") from error
+        raise InputError(f"`prior` {name}: cannot be imported ({type(error).__name__}: {error}); correct it") from error
     frozen = getattr(getattr(kind, "__dataclass_params__", None), "frozen", False)
     if not (isinstance(kind, type) and issubclass(kind, AbstractPrior) and is_dataclass(kind) and frozen):
-        raise InputError(f"--prior {name}: is not a prior; derive a frozen dataclass from modeler.types.AbstractPrior")
+        raise InputError(f"`prior` {name}: is not a prior; derive a frozen dataclass from modeler.types.AbstractPrior")
     known = {field.name for field in fields(kind) if field.init}
     values = {}
     for argument in arguments:
         field, equals, text = argument.partition("=")
         if not equals or field not in known:
             raise InputError(
-                f"--prior-args {argument}: {class_name} has {', '.join(sorted(known)) or 'no fields'}; give NAME=VALUE"
+                f"`prior_args` {argument}: {class_name} has {', '.join(sorted(known)) or 'no fields'}; give NAME=VALUE"
             )
         try:
             values[field] = ast.literal_eval(text)
@@ -306,7 +306,7 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
     try:
         prior = kind(**values)
     except Exception as error:
-        raise InputError(f"--prior {name}: cannot be created ({error}); see --prior-args") from error
+        raise InputError(f"`prior` {name}: cannot be created ({error}); see `prior_args`") from error
     assert isinstance(prior, AbstractPrior)
     return prior
 
@@ -325,7 +325,7 @@ def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> Turntable
     given = dict(given)
     if "step_deg" not in given:
         if not step_deg:
-            raise InputError("--prior turntable needs the rotation from frame to frame; give --step-deg")
+            raise InputError("`prior` turntable needs the rotation from frame to frame; give `step_deg`")
         given["step_deg"] = step_deg
         if sigma_deg is not None and sigma_deg > 0.0:
             given.setdefault("step_sigma_deg", sigma_deg)
@@ -338,10 +338,10 @@ def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> Turntable
 def _held(given: dict[str, Any], sequence: AbstractSequence | None) -> HeldPrior:
     """Return the hand of a sequence."""
     if sequence is None:
-        raise InputError("--prior held reads the robot.txt of one sequence; give one sequence at a time")
+        raise InputError("`prior` held reads the robot.txt of one sequence; give one sequence at a time")
     if sequence.robot_path is None:
         raise InputError(
-            f"{sequence.name}: has no robot.txt for --prior held; write lines `time tx ty tz qx qy qz qw` of "
+            f"{sequence.name}: has no robot.txt for `prior` held; write lines `time tx ty tz qx qy qz qw` of "
             "camera_from_hand there, or use another prior"
         )
     hand = hand_poses(sequence.robot_path)
@@ -355,11 +355,11 @@ def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior
     if given:
         missing = [name for name in _GIVEN["poke"] if name not in given]
         if missing:
-            raise InputError(f"--prior poke needs --{missing[0].replace('_', '-')} as well; give all three")
+            raise InputError(f"`prior` poke needs `{missing[0]}` as well; give all three")
         return PokePrior(Poke(given["poke_point_m"], given["poke_direction"], given["poke_length_m"]))
     pokes = None if sequence is None or sequence.motion is None else sequence.motion.get("pokes")
     if sequence is None or not isinstance(pokes, dict) or not pokes:
-        raise InputError("--prior poke needs --poke-point-m, --poke-direction and --poke-length-m; give them")
+        raise InputError("`prior` poke needs `poke_point_m`, `poke_direction` and `poke_length_m`; give them")
     return PokePrior(pokes=dict(_one_poke(f"{sequence.name}: sequence.json", *one) for one in pokes.items()))
 
 

@@ -43,10 +43,6 @@ class ObjectOptions:
     """Largest depth of the object."""
 
 
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
 _Three = tuple[float, float, float]
 
 
@@ -130,13 +126,13 @@ class PriorOptions:
         for parameter in sorted(given.keys() - set(accepted)):
             others = " or ".join(prior for prior, parameters in of.items() if parameter in parameters)
             raise InputError(
-                f"{_flag(parameter)} is not a parameter of --prior {name}; leave it out, or give --prior {others}."
+                f"`{parameter}` is not a parameter of `prior` {name}; leave it out, or give `prior` {others}."
             )
         for parameter, value in given.items():
             try:
                 check_parameter(parameter, value, exact=False)
             except ParameterError as error:
-                raise InputError(f"{_flag(parameter)} {error.fault}.") from error
+                raise InputError(f"`{parameter}` {error.fault}.") from error
         return given
 
     def parameters(self) -> dict[str, Any]:

@@ -168,7 +168,7 @@ class Experiment:
         if truth is None:
             raise InputError(
                 f"{recorded.name}: has no ground truth to compare with; add scene_gt.json, or judge the loop of a full "
-                "turn by --closed."
+                "turn by `closed`."
             )
         return tuple(index for index in recorded.indices if index in truth)
 

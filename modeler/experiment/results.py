@@ -202,7 +202,7 @@ def evaluate(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from error
+        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with `out`") from error
     trials: list[Trial] = []
     for recorded in sequences:
         for trial in experiment.trials(recorded):

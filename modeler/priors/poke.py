@@ -106,7 +106,7 @@ class PokePrior(AbstractPrior):
         if not found:
             raise InputError(
                 f"no poke is given between frames {earlier} and {later}; give each poke with the first frame after it, "
-                "or use --prior table"
+                "or use `prior` table"
             )
         return found
 

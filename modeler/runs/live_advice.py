@@ -54,7 +54,7 @@ def advising(modeler: Modeler, *receivers: Receiver) -> Iterator[Callable[[Step]
 
 
 def best_manual_action(found: Suggestions) -> Suggestion | None:
-    """Return the best action that needs no input to the run: a poke would need `--prior poke`."""
+    """Return the best action that needs no input to the run: a poke would need `prior` poke."""
     return next((each for each in found.ranked if each.prediction.candidate.action in ("turn", "lay")), None)
 
 

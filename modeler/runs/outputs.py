@@ -1,4 +1,4 @@
-"""Output paths of commands: never inside or over an input, and over an earlier result only with --overwrite."""
+"""Output paths of commands: never inside or over an input, and over an earlier result only with `overwrite`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def check_folder(out: Path, inputs: Iterable[Path]) -> None:
         source = None if identity is None else found.get(identity)
         if source is not None:
             where = "is" if part == place else "lies in"
-            raise InputError(f"{out}: {where} {source}, which is only read; choose another --out")
+            raise InputError(f"{out}: {where} {source}, which is only read; choose another `out`")
 
 
 def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool) -> None:
@@ -46,11 +46,11 @@ def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool
             continue
         if not out.is_file():
             what = "a folder" if out.is_dir() else "not a regular file"
-            raise InputError(f"{out}: is {what}; choose another --out")
+            raise InputError(f"{out}: is {what}; choose another `out`")
         if _identity(out) in {_identity(file) for file in _files(inputs)}:  # by a hard link, or by a link there
-            raise InputError(f"{out}: is a file that is only read; choose another --out")
+            raise InputError(f"{out}: is a file that is only read; choose another `out`")
         if not overwrite:
-            raise InputError(f"{out}: exists already; choose another --out, or give --overwrite")
+            raise InputError(f"{out}: exists already; choose another `out`, or give `overwrite`")
 
 
 def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resume: bool | None = None) -> None:
@@ -71,8 +71,8 @@ def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resu
     folder = RunFolder(out)
     folder.check(overwrite=True)
     if not (overwrite or resume or folder.is_empty):
-        options = "--overwrite" if resume is None else "--overwrite or --resume"
-        raise InputError(f"{out}: not empty; choose another --out, or give {options}")
+        options = "`overwrite`" if resume is None else "`overwrite` or `resume`"
+        raise InputError(f"{out}: not empty; choose another `out`, or give {options}")
 
 
 def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, ...]:

@@ -73,12 +73,12 @@ class Preset:
         if self.purpose in _FILES:
             if self.out.suffix.lower() != _FILES[self.purpose]:
                 raise InputError(
-                    f"{self.out}: --for {self.purpose} writes {_FILES[self.purpose]}; give --out such a suffix"
+                    f"{self.out}: `purpose` {self.purpose} writes {_FILES[self.purpose]}; give `out` such a suffix"
                 )
         else:
             check_folder(self.out, inputs)
             if os.path.lexists(self.out) and not self.out.is_dir():
-                raise InputError(f"{self.out}: is not a folder; choose another --out")
+                raise InputError(f"{self.out}: is not a folder; choose another `out`")
         report = files.RunFolder(self.run_folder).result()
         if not report.get("poses"):
             raise InputError(f"{self.run_folder}: no frame of this run was accepted; report.json says why")
@@ -245,7 +245,7 @@ class Preset:
         for name in scenes:
             folder = out / "onboarding_static" / name
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-                raise InputError(f"{folder}: exists already; remove it or give another --out")
+                raise InputError(f"{folder}: exists already; remove it or give another `out`")
         model = self._model(watertight=False)
         if self.triangles is not None:
             model = files.simplified(model, self.triangles)

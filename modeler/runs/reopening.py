@@ -91,7 +91,7 @@ class Part:
                 raise InputError(
                     f"{self.sequence.name}: frame {frame} differs from the one that {self.run} was made "
                     "from, or another version segments it differently; give the original sequence with "
-                    "--sequence, or build the run again"
+                    "`sequence`, or build the run again"
                 )
             if log_factor:
                 view = self.sensor.refocused(view, log_factor)
@@ -136,7 +136,7 @@ def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
     found = _parts(run, places, ())
     if places:
         raise InputError(
-            f"--sequence is given {len(moved)} times where {run} was made from {len(found)}; give each once"
+            f"`sequence` is given {len(moved)} times where {run} was made from {len(found)}; give each once"
         )
     return found
 
@@ -152,10 +152,10 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
         moved = (replace(part, offset=part.offset + int(settings["offset"])) for part in second)
         return (*first, *moved)
     if places is not None and not places:
-        raise InputError(f"--sequence is given too few times; give that of {run}, too, in order")
+        raise InputError(f"`sequence` is given too few times; give that of {run}, too, in order")
     where = Path(report["sequence"]) if places is None else places.popleft()
     if not where.exists():
-        raise InputError(f"{where}: the sequence of {run} does not exist; give its new place with --sequence")
+        raise InputError(f"{where}: the sequence of {run} does not exist; give its new place with `sequence`")
     sensor, camera = (Path(settings[name]) if name in settings else None for name in ("sensor", "camera"))
     return (Part(run, report, calibrated(open_sequence(where, _overrides(settings)), sensor, camera)),)
 

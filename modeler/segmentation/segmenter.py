@@ -59,10 +59,10 @@ class Segmenter:
         """Check the parameters."""
         if self.roi is not None and not (0 <= self.roi[0] < self.roi[2] and 0 <= self.roi[1] < self.roi[3]):
             raise InputError(
-                f"--roi {' '.join(map(str, self.roi))} is empty; give X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1."
+                f"`roi` {' '.join(map(str, self.roi))} is empty; give X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1."
             )
         if self.max_depth_m is not None and not self.max_depth_m > 0.0:
-            raise InputError(f"--max-depth-m {self.max_depth_m:g} is out of range; give a positive depth in m.")
+            raise InputError(f"`max_depth_m` {self.max_depth_m:g} is out of range; give a positive depth in m.")
 
     def scene(self, frames: Sequence[Frame]) -> Scene:
         """Learn the static background, the object's zone and its support.

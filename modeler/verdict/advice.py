@@ -1,4 +1,4 @@
-"""Advice on a run: what to change, in terms of options."""
+"""Advice on a run: what to change, in terms of parameters, which messages name in backticks."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _ROUGH: Final = (
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method/search.md)
 _FAR_DEG: Final = 100.0  # 1 % of this rotation is 1°, a third of a wrong pose
 _BY_OPTIONS: Final = {
-    Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, --roi and --max-depth-m.",
+    Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, `roi` and `max_depth_m`.",
     Outcome.UNSURE_MASK: (
-        "The object is hard to segment; give --roi, --max-depth-m, or masks that hold only the object."
+        "The object is hard to segment; give `roi`, `max_depth_m`, or masks that hold only the object."
     ),
 }
 
 
 def outcome_advice(outcome: Outcome, prior: AbstractPrior | None = None, posterior: Posterior | None = None) -> str:
-    """Return what to do about an outcome, in terms of options.
+    """Return what to do about an outcome, in terms of parameters.
 
     Args:
         outcome: of a frame or a registration.
@@ -40,13 +40,13 @@ def outcome_advice(outcome: Outcome, prior: AbstractPrior | None = None, posteri
         wanted = posterior.beyond[0] if len(posterior.beyond) else posterior.pose.mean
         wider = _wider(prior, float(np.degrees(se3.rotation_angle(wanted))))
         if wider is not None:
-            options = " ".join(f"--{option} {value}" for option, value in wider.options.items())
-            return f"{wider.words[0].upper()}{wider.words[1:]}: {options}."
+            parameters = " ".join(f"`{name}` {value}" for name, value in wider.parameters.items())
+            return f"{wider.words[0].upper()}{wider.words[1:]}: {parameters}."
     return _BY_OPTIONS.get(outcome, outcome.advice)
 
 
 def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors: Sequence[Posterior] = ()) -> str:
-    """Return what to do about a frame that was left out, in terms of options; "" if there is nothing to do.
+    """Return what to do about a frame that was left out, in terms of parameters; "" if there is nothing to do.
 
     Args:
         reason: why it was left out.
@@ -89,7 +89,7 @@ def measured_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> s
     return (
         f"the views turned by {found_deg:.1f}° from one frame number to the next, not by the given "
         f"{stated_deg:g}° ± {table.step_sigma_deg:g}°; "
-        + (f"try --step-deg {signed_deg:.1f}" if signed_deg else "did the table turn?")
+        + (f"try `step_deg` {signed_deg:.1f}" if signed_deg else "did the table turn?")
     )
 
 
@@ -169,8 +169,8 @@ class Remedy:
 
     words: str
     """For people."""
-    options: Mapping[str, str] = field(default_factory=dict)
-    """Of `modeler build`, by name without dashes, with their values; other given options stay. Empty: no new build."""
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    """Of the next build, with their values; others stay as given. Empty: no new build."""
     first: str = ""
     """A command to run first; "" = none."""
 
@@ -202,7 +202,7 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
 
 
 def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
-    region = {"roi": "X0 Y0 X1 Y1", "max-depth-m": "M"}
+    region = {"roi": "X0 Y0 X1 Y1", "max_depth_m": "M"}
     return Remedy("specify where the object is: the pixels around it in all frames, and the largest depth", region)
 
 
@@ -218,7 +218,7 @@ def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
     """Return how to estimate the focal length, if a loop determines it."""
     if not any(edge["kind"] == "closure" for edge in report["edges"]):
         return _more_known(report, prior)
-    first = "modeler calibrate-camera {run} --out camera.json"
+    first = "modeler calibrate-camera {run} `out` camera.json"
     return Remedy("estimate the focal length from the loop, and build with it", {"camera": "camera.json"}, first)
 
 
@@ -227,13 +227,13 @@ def _full_turn(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None
     if report["closed"]:
         return _camera(report, prior)
     words = "turn the object fully around, or take the focal length from another run with a full turn"
-    return Remedy(words, {"camera": "camera.json"}, "modeler calibrate-camera FULL_TURN --out camera.json")
+    return Remedy(words, {"camera": "camera.json"}, "modeler calibrate-camera FULL_TURN `out` camera.json")
 
 
 def _known_camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
     """Return how to specify whether focal length or depth is right."""
-    first = "modeler calibrate-camera {run} --known focal-length --out known.json"
-    words = "if the given focal length is calibrated (if the depth is accurate instead: --known depth)"
+    first = "modeler calibrate-camera {run} `known` focal-length `out` known.json"
+    words = "if the given focal length is calibrated (if the depth is accurate instead: `known` depth)"
     return Remedy(words, {"camera": "known.json"}, first)
 
 
@@ -242,7 +242,7 @@ def _without_prior(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | 
     if measured_step(report["edges"], prior):
         return None
     if isinstance(prior, TurntablePrior):
-        return Remedy("allow for a larger error of the step", {"step-sigma-deg": f"{3.0 * prior.step_sigma_deg:g}"})
+        return Remedy("allow for a larger error of the step", {"step_sigma_deg": f"{3.0 * prior.step_sigma_deg:g}"})
     return Remedy("register without this prior", {"prior": "general"})
 
 
@@ -254,7 +254,7 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
     free = prior.free if isinstance(prior, AutoPrior) else prior
     if report.get("up") is not None and isinstance(free, GeneralPrior):
         wide = max(turns, default=0.0) >= free.max_rotation_deg - _NEAR_LIMIT_DEG
-        options = {"max-rotation-deg": _twice_deg(free.max_rotation_deg)} if wide else {}
+        options = {"max_rotation_deg": _twice_deg(free.max_rotation_deg)} if wide else {}
         return Remedy("use the prior that the object stays on its table", {"prior": "table", **options})
     if "closures_refused" in report["reason_codes"]:  # the object came back, and the chain of steps missed it
         return _camera(report, prior)
@@ -264,7 +264,7 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
         words += ", which the images do not determine"
     elif turned_deg >= 1.0:
         step, sigma = f"{turned_deg:.0f}", f"{max(_ROUGH * turned_deg, 1.0):.0f}"
-    return Remedy(words, {"prior": "turntable", "step-deg": step, "step-sigma-deg": sigma})
+    return Remedy(words, {"prior": "turntable", "step_deg": step, "step_sigma_deg": sigma})
 
 
 def _sigma_deg(edges: Sequence[Mapping[str, Any]]) -> float:
@@ -292,11 +292,11 @@ def _at_limit(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 def _wider(prior: AbstractPrior, turned_deg: float) -> Remedy | None:
     """Return the limit to raise where a registration ended at a rotation at a limit; None if the prior has none."""
     if isinstance(prior, GeneralPrior | TablePrior) and turned_deg >= prior.max_rotation_deg - _NEAR_LIMIT_DEG:
-        return Remedy("allow for larger rotations", {"max-rotation-deg": _twice_deg(prior.max_rotation_deg)})
+        return Remedy("allow for larger rotations", {"max_rotation_deg": _twice_deg(prior.max_rotation_deg)})
     if isinstance(prior, GeneralPrior):
-        return Remedy("allow for larger offsets", {"max-offset-m": f"{2.0 * prior.max_offset_m:g}"})
+        return Remedy("allow for larger offsets", {"max_offset_m": f"{2.0 * prior.max_offset_m:g}"})
     if isinstance(prior, TablePrior | TurntablePrior):
-        return Remedy("allow for larger shifts", {"max-shift-m": f"{2.0 * prior.max_shift_m:g}"})
+        return Remedy("allow for larger shifts", {"max_shift_m": f"{2.0 * prior.max_shift_m:g}"})
     return None
 
 
@@ -317,4 +317,4 @@ def visible_frames(frames: Sequence[Mapping[str, Any]]) -> str:
     late, early = seen[0] > ids[0], seen[-1] < ids[-1]
     when = [f"from frame {seen[0]} on"] * late + [f"up to frame {seen[-1]}"] * early
     only = f"{seen[0] if late else ''}:{seen[-1] + 1 if early else ''}"
-    return f"the object is visible {', '.join(when)}; --frames {only} selects those frames"
+    return f"the object is visible {', '.join(when)}; `frames` {only} selects those frames"

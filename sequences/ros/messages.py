@@ -163,7 +163,7 @@ def lens(message: Any, where: str, *, ros1: bool) -> Lens:
     distortion = np.asarray(message.D if ros1 else message.d, dtype=np.float64)
     fx, _, cx, _, fy, cy = (float(value) for value in matrix[:6])
     if not sane((fx, fy, cx, cy)) or not np.isfinite(distortion).all():
-        raise InputError(f"{where}: camera_info has no usable K; calibrate the camera, or convert with --intrinsics.")
+        raise InputError(f"{where}: camera_info has no usable K; calibrate the camera, or convert with `intrinsics`.")
     camera = Camera(int(message.width), int(message.height), fx, fy, cx, cy)
     return lens_of_model(camera, distortion.tolist(), str(message.distortion_model), where)
 

@@ -104,7 +104,7 @@ def realsense_lens(bag: Bag, topic: str) -> Lens | None:
         distortion = _numbers(entries.get("coeffs", ""), 5)
         sound = sane((pixels[0], pixels[1], pixels[2], pixels[3])) and bool(np.isfinite(distortion).all())
         if not sound or not (1.0 <= width <= 1e5 and 1.0 <= height <= 1e5):
-            raise InputError(f"{bag.path}: {name}: describes no camera; record it again, or convert with --intrinsics.")
+            raise InputError(f"{bag.path}: {name}: describes no camera; record it again, or convert with `intrinsics`.")
         camera = Camera(int(width), int(height), pixels[0], pixels[1], pixels[2], pixels[3])
         return lens_of_model(camera, distortion.tolist(), entries.get("model", ""), f"{bag.path}: {name}")
     return None

@@ -55,7 +55,7 @@ def choose_depth_topic(bag: Bag, first: Mapping[str, Any], overrides: Overrides)
     if not found:
         raise InputError(f"{bag.path}: holds no depth images (16UC1 or 32FC1); its image topics are: {_names(first)}.")
     if len(found) > 1:
-        raise InputError(f"{bag.path}: {_listed(found)}; convert with --depth-topic.")
+        raise InputError(f"{bag.path}: {_listed(found)}; convert with `depth_topic`.")
     return found[0]
 
 
@@ -73,7 +73,7 @@ def depth_lens(bag: Bag, topic: str, image: Any, overrides: Overrides) -> Lens:
     known = _camera(bag, topic)
     if known is None:
         raise InputError(
-            f"{bag.path}: no camera_info belongs to {topic}; record it too, or convert with --intrinsics FX FY CX CY."
+            f"{bag.path}: no camera_info belongs to {topic}; record it too, or convert with `intrinsics` FX FY CX CY."
         )
     return known
 
@@ -162,7 +162,7 @@ def _same(one: Lens | None, other: Lens) -> bool:
 def choose_unit(bag: Bag, topic: str, image: Any, overrides: Overrides) -> tuple[float, str]:
     """Return the millimetres per unit of 16-bit depth, and the unit for people."""
     if overrides.depth_scale_mm is not None:
-        return overrides.depth_scale_mm, f"{overrides.depth_scale_mm:g} mm (--depth-scale-mm)"
+        return overrides.depth_scale_mm, f"{overrides.depth_scale_mm:g} mm (`depth_scale_mm`)"
     if image.__msgtype__ == messages.IMAGE and image.encoding in messages.METRES:
         return 1000.0, "m (32FC1)"
     found = realsense_unit_mm(bag, topic)

@@ -32,7 +32,7 @@ def missing() -> str | None:
     """Return what is missing to evaluate on a CUDA device, and what to do; None if nothing is."""
     if importlib.util.find_spec("warp") is None:
         return "warp-lang is not installed; pip install -c constraints.txt -e '.[gpu]'"
-    without = "leave --device out, or give --device cpu"
+    without = "leave `device` out, or give `device` cpu"
     try:
         ctypes.CDLL("nvcuda.dll" if hasattr(ctypes, "WinDLL") else "libcuda.so.1")
     except OSError:
