@@ -41,13 +41,18 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["option
 TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
 
-@pytest.mark.parametrize("line", sorted({line for page in PAGES.values() for line in commands(page)}))
+WITH_COMMANDS = (*PAGES.values(), DOCS / "measurements.md", ROOT / "CONTRIBUTING.md")
+
+
+@pytest.mark.parametrize("line", sorted({line for page in WITH_COMMANDS for line in commands(page)}))
 def test_every_command_is_understood(line: str) -> None:
     words = shlex.split(line)
     if words[0] == "modeler":
         assert parsed(words[1:]).run.__doc__
     elif words[0] == "make":
-        assert set(words[1:]) <= set(TARGETS)
+        assert {word for word in words[1:] if "=" not in word} <= set(TARGETS)
+    elif words[:3] == [".venv/bin/python", "-m", "studies"]:
+        assert set(words[3:4]) <= set(STUDIES)
     elif words[:3] == [".venv/bin/pip", "install", "-c"]:
         assert words[3:5] == ["constraints.txt", "-e"]
         assert words[5][2:-1] in EXTRAS
