@@ -37,11 +37,10 @@ NOT_HERE = {
 """What commands ask for that a test has not: they are only understood."""
 QUICK = ("README", "build")
 SEQUENCES = "sequences/bundled/box sequences/bundled/tube turned poked carried shelf/cup shelf/tin".split()
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
+WITH_COMMANDS = (*PAGES.values(), DOCS / "measurements.md", CONTRIBUTING)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-
-
-WITH_COMMANDS = (*PAGES.values(), DOCS / "measurements.md", ROOT / "CONTRIBUTING.md")
 
 
 @pytest.mark.parametrize("line", sorted({line for page in WITH_COMMANDS for line in commands(page)}))
@@ -66,6 +65,12 @@ def test_every_study_that_a_page_names_exists() -> None:
     }
     assert named
     assert named <= set(STUDIES)
+
+
+def test_every_place_that_contributors_are_told_of_exists() -> None:
+    places = set(re.findall(r"`((?:modeler|sequences|viz|tests|studies|docs)/[\w./]*)`", CONTRIBUTING.read_text()))
+    assert len(places) > 20
+    assert [place for place in sorted(places) if not (ROOT / place).exists()] == []
 
 
 class Desk:
