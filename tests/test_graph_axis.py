@@ -13,7 +13,7 @@ from modeler.graph.pose_graph import Factor
 from modeler.types import Array, Edge, PoseGaussian
 
 COUNT, STEP_RAD, SIGMA_STEP_RAD = 14, np.radians(25.0), np.radians(1.0)
-TABLE = CommonAxis(sigma_tilt_rad=np.radians(0.2), sigma_shift_m=0.0005)
+TABLE = CommonAxis(np.radians(0.2), sigma_shift_m=0.0005, sigma_lift_m=0.0005)
 
 
 def _table(
@@ -158,7 +158,7 @@ def test_axis_settles_what_each_pair_leaves_open() -> None:
 @pytest.mark.slow
 def test_table_on_which_things_are_pushed_about_still_has_one_normal() -> None:
     """Steps shift by centimetres, so that they share no axis's place; its direction settles the roll all the same."""
-    pushed, seeds = CommonAxis(sigma_tilt_rad=TABLE.sigma_tilt_rad, sigma_shift_m=0.03), 20
+    pushed, seeds = CommonAxis(TABLE.sigma_tilt_rad, sigma_shift_m=0.03, sigma_lift_m=TABLE.sigma_lift_m), 20
     values, alone, together = np.zeros(seeds), np.zeros(seeds), np.zeros(seeds)
     for seed in range(seeds):
         rng = np.random.default_rng([5, seed])

@@ -132,13 +132,13 @@ class CommonAxis:
     The angle of a step is not part of it: if it is known, edges contain it.
     """
 
-    sigma_tilt_rad: float = float(np.radians(0.2))
+    sigma_tilt_rad: float
     """Tilt of the object against the axis in a step, by wobble or slip. Infinite if edges already contain the axis'
     direction: steps then share its position only."""
-    sigma_shift_m: float = 0.0005
+    sigma_shift_m: float
     """Slip across the axis in a step. Some centimetres describe a table on which the object is pushed about: steps then
     share the table's normal only."""
-    sigma_lift_m: float = 0.0005
+    sigma_lift_m: float
     """Slip along the axis in a step; infinite if edges already contain it."""
 
     def solve(self, factors: Sequence[Factor], trajectory: Mapping[int, Array], root: int) -> AxisSolution | None:

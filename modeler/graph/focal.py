@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from modeler import se3
-from modeler.graph.optimise import Optimum, optimise
+from modeler.graph.optimise import MAX_ROUNDS, Optimum, optimise
 from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain
 from modeler.graph.smoother import Smoother
 from modeler.types import Array, FocalLength, Solution
@@ -22,8 +22,8 @@ RELIEF_ERROR = 0.008
 """Relative error of the depth's relief, which loops cannot distinguish from a focal length: measured (eq. 10.4)."""
 
 _STEP = 0.005  # of finite differences, at most a quarter of the prior's standard deviation: a few posterior ones
-_ROUNDS = 8  # of Newton's method at most; near the optimum two or three are enough
-_MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
+_REGISTRATIONS = 5  # of the edges at most, each about the estimate so far; eight captures take one to five
+MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
 _GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
 _CONVERGED = 0.25  # standard deviations that the last registration of the edges moves the estimate
 _MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.56 to 1
@@ -40,8 +40,6 @@ class MovingGraph:
     """Frame whose pose is the identity."""
     start: Mapping[int, Array]
     """Initial object_from_camera (4, 4) by frame number; for other frames, dead reckoning."""
-    threshold: float = 0.5 * Smoother.outlier_distance**2
-    """Error in nats beyond which a loop is an outlier."""
 
     @classmethod
     def of(cls, graph: PoseGraph, solution: Solution) -> MovingGraph:
@@ -63,10 +61,10 @@ class MovingGraph:
         step = min(_STEP, 0.25 * prior_sigma)
         best, curvature = prior_mean, 1.0 / prior_sigma**2
         if not all(self.at(prior_mean).inlier):  # outliers have no gradient there
-            reach = _MAX_SIGMAS * prior_sigma
+            reach = MAX_SIGMAS * prior_sigma
             grid = np.linspace(prior_mean - reach, prior_mean + reach, 1 + 2 * int(np.ceil(reach / _GRID)))
             best = min(grid.tolist(), key=cost)
-        for _ in range(_ROUNDS if self.loops else 0):
+        for _ in range(MAX_ROUNDS if self.loops else 0):
             less, middle, more = (cost(best + shift) for shift in (-step, 0.0, step))
             curvature = max((less - 2.0 * middle + more) / step**2, 1.0 / prior_sigma**2)
             move = float(np.clip((less - more) / (2.0 * step * curvature), -2.0 * prior_sigma, 2.0 * prior_sigma))
@@ -117,6 +115,11 @@ class MovingGraph:
         # Inliers are not taken from nearby: dead reckoning may contradict a loop that all edges together can close.
         return optimise(tree, loops, start, root=root, threshold=self.threshold)
 
+    @property
+    def threshold(self) -> float:
+        """Error in nats beyond which a loop is an outlier."""
+        return 0.5 * Smoother.outlier_distance**2
+
     @cached_property
     def loops(self) -> int:
         """Number of loops."""
@@ -128,7 +131,11 @@ class MovingGraph:
 
 
 def estimate_focal_length(
-    estimate_at: Callable[[float], FocalLength], *, rounds: int, reach: float, tolerance: float = _CONVERGED
+    estimate_at: Callable[[float], FocalLength],
+    *,
+    reach: float,
+    rounds: int = _REGISTRATIONS,
+    tolerance: float = _CONVERGED,
 ) -> FocalLength:
     """Return the focal length, estimated iteratively from edges registered under each estimate (method, eq. 10.5).
 
@@ -138,8 +145,8 @@ def estimate_focal_length(
     Args:
         estimate_at: returns the estimate by edges registered under a focal length, relative to it; its argument is the
             logarithm of this focal length over the given one.
-        rounds: largest number of registrations of the edges.
         reach: largest absolute logarithm.
+        rounds: largest number of registrations of the edges.
         tolerance: step in standard deviations below which the iteration ends.
     """
     first = estimate = estimate_at(0.0)
@@ -154,7 +161,7 @@ def estimate_focal_length(
         estimate = estimate_at(centre)
         if abs(centre - before) > estimate.sigma:  # in less, the noise of registrations would show
             share = float(np.clip((step - estimate.log_factor) / (centre - before), _MIN_SHARE, 1.0))
-    if estimate.told_by == "prior" and abs(centre) > _MAX_SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2):
+    if estimate.told_by == "prior" and abs(centre) > MAX_SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2):
         # Farther from the prior's mean than such weak evidence can lead: the rounds disagree, so that an edge is wrong.
         centre, estimate = 0.0, replace(estimate, sigma=estimate.prior_sigma)
     # Noise moves the end of the iteration by as many times more as its steps are too short.

@@ -23,9 +23,8 @@ _ANCHOR_SIGMA = 1e-6  # rad and m, of the root: far below any registration's
 _ANNEALING_TOLERANCE = 1e-4  # of the error; the inliers that annealing finds are then solved to convergence
 _RELINEARISE = 1e-3  # rad and m from the linearisation point: relative error of a factor's residual
 _WILDFIRE = 1e-5  # changes in rad and m below which iSAM2 stops back substitution
-_MAX_ROUNDS = 8  # of relinearisation; if more are needed, the initial value was too far off
-_QUORUM = 3  # loops that agree with each other before new ones are tested against them alone
-_MAX_NEW_LOOPS = 3  # tested so at once
+MAX_ROUNDS = 8  # of whatever iterates over solutions; if more are needed, the initial value was too far off
+_QUORUM = 3  # loops that agree with each other before as many new ones are tested against them alone
 
 Inlier = tuple[bool, ...]
 """Whether each loop takes part, in their order."""
@@ -207,7 +206,7 @@ def _updated(
         gtsam_graph.push_back(factor.between)
     try:
         result = engine.update(gtsam_graph, values)
-        for _ in range(_MAX_ROUNDS):
+        for _ in range(MAX_ROUNDS):
             if result.getVariablesRelinearized() == 0:
                 return IncrementalSolver(frozenset(factors), engine)
             result = engine.update()
@@ -264,7 +263,7 @@ def _continued(
     known, engine = before
     new = len(loops) - len(known)
     choices = [(True,) * new]
-    if sum(known) >= max(_QUORUM, 2 * known.count(False)) and new <= _MAX_NEW_LOOPS:
+    if sum(known) >= max(_QUORUM, 2 * known.count(False)) and new <= _QUORUM:
         choices = sorted(itertools.product((True, False), repeat=new), key=lambda choice: choice.count(False))
     best: tuple[float, Inlier, IncrementalSolver] | None = None
     for choice in choices:

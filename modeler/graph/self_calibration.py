@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import final
 
 from modeler.graph import MovingGraph, estimate_focal_length
+from modeler.graph.focal import MAX_SIGMAS
 from modeler.graph.pose_graph import Factor, collapse_modes
 from modeler.priors.proposals import PredictedProposal
 from modeler.types import AbstractPrior, Edge, FocalLength, Posterior, RayImage
@@ -23,7 +24,6 @@ Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
 """Returns the posterior of target_from_source of a source and a target view under a prior."""
 
 _LIMIT_STEPS = 2.0  # steps for which limits hold, as where a run places a view that one step's do not
-_MAX_ROUNDS = 6  # of registering the edges again about the estimate; on captures two to four are enough
 
 
 @final
@@ -32,10 +32,8 @@ class FocalCalibrator:
     """Estimates the focal length from the views and the edges of a run."""
 
     prior_sigma: float = 0.05
-    """Prior standard deviation of log c. Given focal lengths of three captures were off by 4 to 10 %, calibrated ones
-    by 1 %."""
-    reach: float = 0.15
-    """Largest |log c| that is considered: three standard deviations."""
+    """Prior standard deviation of log c; up to three of them are considered. Given focal lengths of three captures were
+    off by 4 to 10 %, calibrated ones by 1 %."""
 
     def estimate(
         self,
@@ -64,7 +62,7 @@ class FocalCalibrator:
             graph = MovingGraph([factor for factor in found if factor is not None], root, {})
             return graph.estimate(self.prior_sigma, -centre)
 
-        return estimate_focal_length(estimate_at, rounds=_MAX_ROUNDS, reach=self.reach)
+        return estimate_focal_length(estimate_at, reach=MAX_SIGMAS * self.prior_sigma)
 
     def _registered(self, edge: Edge, made: _Made, register: Register, prior: AbstractPrior) -> Factor | None:
         """Return an edge under another focal length; None if its change is unknown.

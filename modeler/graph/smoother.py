@@ -12,11 +12,9 @@ import numpy as np
 from modeler.graph.axis import AxisSolution, CommonAxis
 from modeler.graph.covariance import PoseCovariances, RelativeCovariance, SharedCovariance
 from modeler.graph.modes import select_modes
-from modeler.graph.optimise import IncrementalSolver, inliers, selected, solve_loops, values_of
+from modeler.graph.optimise import MAX_ROUNDS, IncrementalSolver, inliers, selected, solve_loops, values_of
 from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes, extended
 from modeler.types import Array, Edge, FocalLength, Solution
-
-_MAX_ROUNDS = 5  # of alternating between the axis and the inliers among the loops
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +188,7 @@ class Smoother:
     ) -> tuple[tuple[bool, ...], AxisSolution | None]:
         """Return which loops are inliers, and the solution with a common axis; None if there is none."""
         agreeing, inlier, found = state.inlier, state.inlier, None
-        for _ in range(_MAX_ROUNDS):
+        for _ in range(MAX_ROUNDS):
             inlier = agreeing
             found = axis.solve([*tree, *selected(loops, inlier)], trajectory, state.root or 0)
             if found is None:

@@ -44,7 +44,6 @@ _MAX_VIEWS: Final = 20  # of a segment, compared with as many of the other
 _COARSE_VOXELS: Final = 64**3  # of models to align
 _MAX_ALIGNMENTS: Final = 4  # about which pairs of views are registered
 _TAIL: Final = 0.01  # probability of rejecting a true alignment
-_UNLIMITED_VIEWS: Final = 6  # of each segment, whose pairs are registered without limits
 MIN_JOINS: Final = 2
 """Pairs of views that must agree on an alignment: nothing confirms a single one."""
 
@@ -191,7 +190,7 @@ class Joiner:
     def _by_views(self, target: Segment, source: Segment) -> list[Array]:
         """Return alignments (4, 4) from registering pairs of views, some of each segment, without limits."""
         least_effort, prior = self.registrations.registrar.least_effort, AnyMotion()
-        some = [self._spread(segment, _UNLIMITED_VIEWS) for segment in (target, source)]
+        some = [self._spread(segment, Joiner.pairs) for segment in (target, source)]
         found = []
         for view, other in itertools.product(some[0].values(), some[1].values()):
             posterior = self.registrations.register(other, view, prior.between(other, view), effort=least_effort)
@@ -258,7 +257,7 @@ class Joiner:
 
     def _independent(self, target: Segment, source: Segment) -> float:
         """Return the median number of independent measurements of a pair of views, one of each segment."""
-        pairs = itertools.product(self._spread(source, _UNLIMITED_VIEWS).values(), self._spread(target, 1).values())
+        pairs = itertools.product(self._spread(source, Joiner.pairs).values(), self._spread(target, 1).values())
         return float(np.median([pair.temper * pair.points for pair in (self._pair(*views) for views in pairs)]))
 
     def _spread(self, segment: Segment, count: int) -> dict[int, RayImage]:

@@ -45,7 +45,6 @@ from modeler.types import (
 from modeler.verdict import judged
 from modeler.views import Sensor
 
-_FOCAL_ROUNDS = 5  # registrations of the edges at most; eight captures take one to five
 _FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures are off by up to 4.5
 _MIN_SEGMENT = 3  # frames that fit each other: two may do so by chance
 
@@ -443,7 +442,7 @@ class Run:
                 state, at = moved.reregistered(self.modeler.tracker(moved).between_views), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
-        focal = estimate_focal_length(estimate_at, rounds=_FOCAL_ROUNDS, reach=_FOCAL_REACH * sigma)
+        focal = estimate_focal_length(estimate_at, reach=_FOCAL_REACH * sigma)
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:

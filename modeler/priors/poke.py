@@ -14,7 +14,6 @@ from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError,
 
 _STEPS = 20  # integration steps of a push
 _PUSHES = 512  # samples of a push
-_DIMENSIONS = 7
 _MIN_IN_PLANE = 0.1  # component of a direction in the plane: within six degrees of the normal it is an error
 
 
@@ -113,7 +112,7 @@ class PokePrior(AbstractPrior):
     def _outcomes(self, poke: Poke, before: RayImage, plane: OnPlane) -> Array:
         """Draw outcomes (n, 3) of a push: turn in rad, and the centroid's position relative to the later one's in m."""
         rng = np.random.default_rng(0)  # equal pushes give equal outcomes
-        noise = rng.normal(size=(_PUSHES, _DIMENSIONS))
+        noise = rng.normal(size=(_PUSHES, 7))
         in_plane = plane.axes[:2]
         push = in_plane @ np.array(poke.direction)
         push = push / np.linalg.norm(push)

@@ -170,9 +170,6 @@ def _weighted(
     return drawn, logs[0] + logs[1] - mixture
 
 
-_TABLE_PROBABILITY = 0.5  # even odds; motion on a table is about 12 nats denser than free motion of the same limits
-
-
 @dataclass(frozen=True)
 class AutoPrior(AbstractPrior):
     """A mixture of free motion and motion on the table, if the views show one (method, eq. 3.3).
@@ -192,7 +189,8 @@ class AutoPrior(AbstractPrior):
         if support(source, target) is None:
             return free
         on_table = self.table.between(source, target)
-        return Alternatives((on_table, free), np.array([_TABLE_PROBABILITY, 1.0 - _TABLE_PROBABILITY]))
+        # Even odds: motion on a table is about 12 nats denser than free motion of the same limits.
+        return Alternatives((on_table, free), np.array([0.5, 0.5]))
 
     def relaxed(self, steps: float) -> AutoPrior:
         """Return the prior with limits for several steps."""

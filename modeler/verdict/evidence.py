@@ -47,7 +47,7 @@ WRONG_RAD: Final = np.radians(3.0)
 """Error above which a rotation is called wrong."""
 WRONG_SHARE: Final = 0.05
 """Largest probability that a pose is wrong: the complement of 95 % regions."""
-MAX_OTHER_MODE: Final = 0.05
+MAX_OTHER_MODE: Final = WRONG_SHARE
 """Largest probability that some pair is at another mode: the complement of 95 % regions."""
 
 _DRAWS: Final = 1000  # of a prior: the best of them lies 0.2 nats below the mode of a Gaussian in six dimensions

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler.kernels import planes
-from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage
+from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage, SensorNoise
 from modeler.views.range_noise import RangeNoise
-from modeler.views.sparsity import closed, gap_px, measured_share, nearest_depth
+from modeler.views.sparsity import ON_PLANE, closed, gap_px, measured_share, nearest_depth
 
+_KINECT = SensorNoise()
 _ALIKE = 2.0  # areas of correlated noise that err alike: measured
 _RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen to 1/e: measured
 
@@ -20,9 +21,9 @@ _RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen
 class Sensor:
     """Noise of the depth camera in ray coordinates (paper, section II), and how its images are smoothed."""
 
-    sigma_wh: float = 0.002
+    sigma_wh: float = _KINECT.sigma_wh
     """Lateral noise in (w, h); the paper's value for the first Kinect."""
-    sigma_r_m: float = 0.002
+    sigma_r_m: float = _KINECT.sigma_r_m
     """Noise along the ray in m, for a surface that faces the camera."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
     """Shift of colours beside depth from one image to the next, in px: they are aligned so well at best, and may be
@@ -38,7 +39,7 @@ class Sensor:
     away from the camera, so that the image of a turning object lags behind it. With this radius the displacement is the
     same share of the noise, whatever the noise (method, eq. 1.1).
     """
-    min_neighbours: float = 25.0
+    min_neighbours: float = ON_PLANE
     """The ball grows until it holds about this many pixels of a surface that faces the camera."""
     noise_area_px: float = 12.5
     """Integral of the autocorrelation of the sensor's noise over the image in px: depth cameras compare windows.

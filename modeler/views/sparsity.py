@@ -8,7 +8,7 @@ from scipy import ndimage
 from modeler.kernels import planes
 from modeler.types import BoolArray, Camera, Float32Array
 
-_ON_PLANE = 25.0  # measurements to which a plane is fitted: as many as in `rays`
+ON_PLANE = 25.0  # measurements to which a plane is fitted
 _UNLIKELY = 0.01  # probability that random loss leaves a hole of the radius of `gap_px`
 _LEAST = 0.01  # least share; of fewer measurements no more than a few would be in reach of each other
 _WIDE_PX = 10
@@ -97,7 +97,7 @@ def interpolated(depth_m: Float32Array, camera: Camera) -> Float32Array:
         return depth_m
     between = closed(measured, gap)
     guess_m = nearest_depth(depth_m, measured, between, gap)
-    reach_px = np.sqrt(_ON_PLANE / (np.pi * share))
+    reach_px = np.sqrt(ON_PLANE / (np.pi * share))
     radius_m = float(reach_px * np.median(depth_m[measured]) / camera.fx)
     ball = planes.Ball(radius_m, int(np.ceil(1.2 * reach_px)), 1, noise_m=0.0)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])

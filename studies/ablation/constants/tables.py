@@ -29,6 +29,7 @@ _FIGURES: Final = {
     "edges": "edges",
     "taking_part": "that take part",
 }
+_NO_FIGURES: Final = ("number", "factor", "stage", "input", "digest", "seconds")
 _TOLERANCE: Final = 1e-3  # relative, below which figures count as the same
 _BEGIN: Final = "<!-- the tables of `python -m studies ablation.constants --table` -->"
 _END: Final = "<!-- end of the tables -->"
@@ -64,7 +65,8 @@ def _changed(record: Mapping[str, Any], default: Mapping[str, Any]) -> dict[str,
     return {
         name: [_rounded(default[name]), _rounded(record[name])]
         for name in record
-        if name in _FIGURES and _differ(record[name], default[name])
+        if (name in _FIGURES or (record["stage"] == "densities" and name not in _NO_FIGURES))
+        and _differ(record[name], default[name])
     }
 
 
@@ -123,7 +125,10 @@ def _words(way: Mapping[str, Any] | None) -> str:
     figures = way["figures"]
     if "error" in figures:
         return f"{way['input']}: {figures['error']}"
-    changes = [f"{_FIGURES[name]} {before} → {after}" for name, (before, after) in figures.items()]
+    changes = [
+        f"{_FIGURES.get(name, f'log density of {name}')} {before} → {after}"
+        for name, (before, after) in figures.items()
+    ]
     return f"{way['input']}: {'; '.join(changes) or 'figures the same to 0.1 %'}"
 
 
