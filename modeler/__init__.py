@@ -59,6 +59,7 @@ if TYPE_CHECKING:
         Posterior,
         Solution,
         Step,
+        Verdict,
     )
     from modeler.views import Sensor
 
@@ -88,6 +89,7 @@ _MODULES = {
         "Posterior",
         "Solution",
         "Step",
+        "Verdict",
     ),
     "modeler.sequences": ("open_sequence",),
 }
@@ -115,6 +117,7 @@ __all__ = [
     "TablePrior",
     "TurntablePrior",
     "VelocityPrior",
+    "Verdict",
     "VisibilityRegistrar",
     "build",
     "open_sequence",

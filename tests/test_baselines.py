@@ -14,19 +14,16 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.experiment import sparse_view
-from modeler.features import kabsch, mutual_matches
-from modeler.priors import GeneralPrior
-from modeler.registration import (
+from modeler.baselines import (
     ColouredIcpRegistrar,
     FpfhIcpRegistrar,
     FpfhRegistrar,
     GicpRegistrar,
     IcpRegistrar,
     KissIcpRegistrar,
+    kiss,
 )
-from modeler.registration.baselines import kiss
-from modeler.registration.baselines.clouds import (
+from modeler.baselines.clouds import (
     Cloud,
     Fit,
     Matches,
@@ -37,7 +34,10 @@ from modeler.registration.baselines.clouds import (
     start,
     whitened_jacobian,
 )
-from modeler.registration.baselines.coloured_icp import intensity_gradients
+from modeler.baselines.coloured_icp import intensity_gradients
+from modeler.experiment import sparse_view
+from modeler.priors import GeneralPrior
+from modeler.registration.features import kabsch, mutual_matches
 from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
 
 BODY = tabletop.Box((0.05, 0.08, 0.035))

@@ -12,9 +12,10 @@ from scipy.spatial import KDTree
 from slow_cases import sampled
 
 from modeler import se3
+from modeler.baselines import IcpRegistrar
 from modeler.evaluation import rotation_error_deg, sample_surface, true_motion
 from modeler.priors import TablePrior
-from modeler.registration import IcpRegistrar, VisibilityRegistrar
+from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.sampling import AdaptiveSampler
 from modeler.sequences.rendering.renderer import RenderedSequence

@@ -17,12 +17,12 @@ import trimesh
 from command_runner import BOX, FILES, Run
 
 from modeler import priors, se3
+from modeler.baselines import kiss
 from modeler.cli.console import Interrupt
 from modeler.composition import compose, main
 from modeler.composition.compose import comes_back
 from modeler.composition.options import PriorOptions
 from modeler.export import RunFolder, model_upright
-from modeler.registration.baselines import kiss
 from modeler.sequences import bundled, open_sequence
 from modeler.types import ACCEPTED, Outcome
 from modeler.verdict.advice import measured_step, sign_in_doubt, visible_frames

@@ -9,7 +9,7 @@ from prior_cases import surface
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
-from modeler.features import FeatureMatcher, fpfh, kabsch, mutual_matches
+from modeler.registration.features import FeatureMatcher, fpfh, kabsch, mutual_matches
 from modeler.sequences.rendering.renderer import RenderedSequence
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, rendered_views, staged

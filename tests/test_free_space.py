@@ -9,10 +9,10 @@ from slow_cases import sampled
 from test_kernels import ANISOTROPIC, INTRINSICS, ISOTROPIC, SHAPE, random_pose
 
 from modeler import se3
+from modeler.baselines.paper import FreeSpace, Measured, NumberedDraws
 from modeler.kernels import paper as kernel
 from modeler.priors import TablePrior
 from modeler.priors.general import GeneralDensity, GeneralPrior
-from modeler.registration.baselines.paper import FreeSpace, Measured, NumberedDraws
 from modeler.se3 import matrices, rows
 
 CENTRE_M = np.array([0.02, -0.03, 0.8])

@@ -10,10 +10,10 @@ import tabletop
 from test_free_space import NOISES, scene
 from test_kernels import random_pose
 
+from modeler.baselines import PaperRegistrar
+from modeler.baselines.paper import FreeSpace, NumberedDraws, measured
 from modeler.kernels import gpu, paper
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.registration import PaperRegistrar
-from modeler.registration.baselines.paper import FreeSpace, NumberedDraws, measured
 from modeler.se3 import rows
 from modeler.sequences import bundled
 from modeler.types import Plane

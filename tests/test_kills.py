@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from modeler.baselines import IcpRegistrar
 from modeler.cli import build, main
 from modeler.export import PairCache, Pairs, RunFolder, RunMeta, alone
 from modeler.priors import GeneralPrior
-from modeler.registration import IcpRegistrar
 from modeler.sequences import bundled, open_sequence
 from modeler.types import AbstractPoseDensity, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
 from modeler.views import Sensor

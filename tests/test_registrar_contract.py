@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tabletop
 
-from modeler import registration, se3
+from modeler import baselines, registration, se3
 from modeler.priors import GeneralPrior, PredictedProposal
 from modeler.types import (
     AbstractPoseDensity,
@@ -28,22 +28,22 @@ BODY = tabletop.Box((0.05, 0.08, 0.035))
 POSES = tabletop.turntable(24)[2:4]
 
 CLOUD_METHODS: list[AbstractRegistrar] = [
-    registration.IcpRegistrar(),
-    registration.GicpRegistrar(),
-    registration.FpfhRegistrar(),
-    registration.FpfhIcpRegistrar(),
-    registration.ColouredIcpRegistrar(),
+    baselines.IcpRegistrar(),
+    baselines.GicpRegistrar(),
+    baselines.FpfhRegistrar(),
+    baselines.FpfhIcpRegistrar(),
+    baselines.ColouredIcpRegistrar(),
 ]
 IMAGE_METHODS: list[AbstractRegistrar] = [
     registration.VisibilityRegistrar(),
-    registration.PaperRegistrar(samples=500_000, points=25),
+    baselines.PaperRegistrar(samples=500_000, points=25),
 ]
 METHODS = CLOUD_METHODS + IMAGE_METHODS
 
 TOLERANCE = 2.5, 0.004  # degrees, m
 # Features without refinement, on a body that has three edges and no other feature; the nearest of few samples.
 COARSE_TOLERANCE = 8.0, 0.012
-COARSE = registration.FpfhRegistrar, registration.PaperRegistrar
+COARSE = baselines.FpfhRegistrar, baselines.PaperRegistrar
 
 FOUND = Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.DEGENERATE
 
@@ -121,7 +121,7 @@ def test_swapping_the_views_inverts_the_motion(method: AbstractRegistrar) -> Non
 
 @pytest.mark.parametrize(
     "method",
-    [registration.VisibilityRegistrar(), registration.PaperRegistrar(samples=50_000, points=4)],
+    [registration.VisibilityRegistrar(), baselines.PaperRegistrar(samples=50_000, points=4)],
     ids=lambda m: type(m).__name__,
 )
 def test_a_guess_tells_where_to_look_and_is_no_evidence(method: AbstractRegistrar) -> None:

@@ -12,13 +12,14 @@ from closure_runs import ABOUT_OBJECT, COVARIANCE, turned, view
 from test_pipeline import FRAMES, Oracle, modeler, run, trajectory_error
 
 from modeler import se3
+from modeler.baselines import IcpRegistrar
 from modeler.closure import Closer
 from modeler.pipeline import Modeler
 from modeler.pipeline.attempts import unless_alike
 from modeler.pipeline.pairs import Registrations
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
-from modeler.registration import IcpRegistrar, VisibilityRegistrar
+from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene
 from modeler.types import (

@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, Literal
 
-from modeler import registration
+from modeler import baselines, registration
+from modeler.baselines import kiss
 from modeler.closure import Closer
 from modeler.composition.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.fusion import Fuser
@@ -32,7 +33,6 @@ from modeler.priors import (
     turntable_in,
 )
 from modeler.priors.checks import ParameterError
-from modeler.registration.baselines import kiss
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.sequences import AbstractSequence
 from modeler.sequences.hand_shapes import hand_poses
@@ -132,21 +132,21 @@ def registrar(
         case "visibility":
             return registration.VisibilityRegistrar(registration.VisibilityLikelihood(colour=colour))
         case "paper":
-            return registration.PaperRegistrar(device=device or "auto")
+            return baselines.PaperRegistrar(device=device or "auto")
         case "icp":
-            return registration.IcpRegistrar()
+            return baselines.IcpRegistrar()
         case "gicp":
-            return registration.GicpRegistrar()
+            return baselines.GicpRegistrar()
         case "coloured-icp":
-            return registration.ColouredIcpRegistrar()
+            return baselines.ColouredIcpRegistrar()
         case "fpfh":
-            return registration.FpfhRegistrar()
+            return baselines.FpfhRegistrar()
         case "fpfh-icp":
-            return registration.FpfhIcpRegistrar()
+            return baselines.FpfhIcpRegistrar()
         case "kiss":
             if not kiss.installed():
                 raise InputError(f"`method` kiss: {kiss.MISSING}")
-            return registration.KissIcpRegistrar()
+            return baselines.KissIcpRegistrar()
 
 
 def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> AbstractPrior:

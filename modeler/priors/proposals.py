@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.features import FeatureMatcher
 from modeler.priors.checks import check_parameters
 from modeler.priors.general import GeneralPrior
 from modeler.priors.mixtures import KernelMixture, defensive_mixture
+from modeler.registration.features import FeatureMatcher
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, PoseGaussian, RayImage, SharedAxis, Solution
 
 _MIN_SIGMA_RAD, _MIN_SIGMA_M = np.radians(2.0), 0.004  # the search does not need more precision
@@ -146,7 +146,7 @@ class VelocityPrior(AbstractProposal):
 
 @dataclass(frozen=True)
 class FeaturesPrior(AbstractProposal):
-    """Poses on which matches of FPFH features agree, each the centre of a kernel (`modeler.features`)."""
+    """Poses on which matches of FPFH features agree, each the centre of a kernel (`modeler.registration.features`)."""
 
     features_sigma_deg: float = 4.0
     """Standard deviation of each kernel in rotation, about each axis."""

@@ -16,8 +16,8 @@ from statistics import median
 import numba
 import numpy as np
 
+from modeler.baselines import PaperRegistrar
 from modeler.kernels import gpu
-from modeler.registration import PaperRegistrar
 from modeler.sequences import bundled, open_sequence
 from modeler.types import RayImage
 from modeler.views import Sensor

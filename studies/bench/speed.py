@@ -10,11 +10,12 @@ from unittest.mock import patch
 import numba
 import numpy as np
 
+from modeler.baselines import PaperRegistrar
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.kernels import scores
 from modeler.kernels.point_likelihood import Projection
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.registration import PaperRegistrar, VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import AbstractSequence, bundled, open_sequence
 from modeler.types import AbstractPrior, Array, Frame, Plane, RayImage

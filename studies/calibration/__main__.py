@@ -20,8 +20,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from modeler.baselines import ColouredIcpRegistrar
 from modeler.export import write_atomically
-from modeler.registration import ColouredIcpRegistrar
 from modeler.types import InputError
 from modeler.viz.figures import Curve, Panel, coverage_curves
 from studies.calibration.specimens import PRINTED, SPECIMENS

@@ -26,10 +26,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from modeler import se3
+from modeler.baselines import IcpRegistrar
 from modeler.evaluation import about_point, nees, rotation_error_deg, true_motion
 from modeler.export import write_atomically
 from modeler.priors import GeneralPrior, TablePrior
-from modeler.registration import IcpRegistrar, VisibilityRegistrar
+from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences.rendering.renderer import RenderedSequence, surroundings
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage

@@ -9,10 +9,11 @@ from typing import final
 import numpy as np
 
 from modeler import se3
+from modeler.baselines import IcpRegistrar
 from modeler.evaluation import about_point, nees, rotation_error_deg, translation_error_m, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
-from modeler.registration import IcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.renderer import RenderedSequence

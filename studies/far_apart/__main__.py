@@ -21,11 +21,11 @@ from typing import Final, final, get_args
 
 import numpy as np
 
+from modeler.baselines import FpfhIcpRegistrar, KissIcpRegistrar, kiss
 from modeler.evaluation import rotation_error_deg
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
-from modeler.registration import FpfhIcpRegistrar, KissIcpRegistrar, VisibilityLikelihood, VisibilityRegistrar
-from modeler.registration.baselines import kiss
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.types import AbstractRegistrar, Posterior
 from studies.far_apart.pairs import Limits, Pair, pairs
 

@@ -11,8 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from modeler.baselines import IcpRegistrar
 from modeler.cli import main
-from modeler.registration import IcpRegistrar, VisibilityRegistrar
+from modeler.registration import VisibilityRegistrar
 
 _MAKING = os.O_CREAT | os.O_TRUNC
 

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.features import FeatureMatcher
 from modeler.kernels import mixture
 from modeler.kernels.gauss_newton import Regulariser
+from modeler.registration.features import FeatureMatcher
 from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
 from modeler.registration.visibility.likelihood import MISFIT, PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.features import fpfh, kabsch, mutual_matches
-from modeler.registration.baselines.clouds import (
+from modeler.baselines.clouds import (
     AbstractCloudRegistrar,
     Cloud,
     Fit,
@@ -20,7 +19,8 @@ from modeler.registration.baselines.clouds import (
     plane_residuals,
     whitened_jacobian,
 )
-from modeler.registration.baselines.icp import IcpRegistrar
+from modeler.baselines.icp import IcpRegistrar
+from modeler.registration.features import fpfh, kabsch, mutual_matches
 from modeler.types import Array, RayImage
 
 _SAMPLE_SIZE = 3  # correspondences that determine a motion

@@ -8,8 +8,8 @@ from typing import final
 import numpy as np
 from scipy.spatial import KDTree
 
-from modeler.registration.baselines.clouds import Cloud, Fit, Matches, nearest, plane_residuals
-from modeler.registration.baselines.icp import AbstractMultiscaleRegistrar, Linearised, by_levels, descended
+from modeler.baselines.clouds import Cloud, Fit, Matches, nearest, plane_residuals
+from modeler.baselines.icp import AbstractMultiscaleRegistrar, Linearised, by_levels, descended
 from modeler.types import Array, RayImage
 
 _DAMPING = 1e-9  # relative to the mean spread; only fixes gradients in directions without neighbours

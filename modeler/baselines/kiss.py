@@ -12,8 +12,8 @@ from typing import Any, final
 
 import numpy as np
 
-from modeler.registration.baselines.clouds import AbstractCloudRegistrar, Cloud, Fit, cube_edges_m
-from modeler.registration.baselines.icp import IcpRegistrar
+from modeler.baselines.clouds import AbstractCloudRegistrar, Cloud, Fit, cube_edges_m
+from modeler.baselines.icp import IcpRegistrar
 from modeler.types import Array, InputError, RayImage
 
 MISSING = "KISS-Matcher is not installed; install it with: pip install -c constraints.txt -e '.[peers]'"

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.registration.baselines.clouds import (
+from modeler.baselines.clouds import (
     AbstractCloudRegistrar,
     Cloud,
     Fit,

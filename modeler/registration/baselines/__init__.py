@@ -1,1 +1,0 @@
-"""Baselines: ICP, GICP, FPFH with RANSAC, KISS-Matcher, and the paper's sampler as published."""
