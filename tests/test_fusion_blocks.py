@@ -12,8 +12,8 @@ import tabletop
 from scipy.spatial import KDTree
 
 from modeler.fusion import Fuser, depth_views
-from modeler.fusion.exposure import _solved
 from modeler.fusion.fuser import downsampled, voxel_means
+from modeler.fusion.support import _solved
 from modeler.system.disk_arrays import DiskArrays, ViewStore
 
 VOXEL_M = 0.002

@@ -8,7 +8,7 @@ from tabletop import edge_uses
 
 from modeler import se3
 from modeler.fusion import meshing
-from modeler.fusion.distance_field import DistanceField, VoxelGrid
+from modeler.fusion.meshing import DistanceField, VoxelGrid
 from modeler.kernels import marching_cubes, occupancy, point_clouds, tsdf
 
 

@@ -22,7 +22,7 @@ from modeler.fusion.depth_views import (
     posed_views,
     view_blocks,
 )
-from modeler.fusion.exposure import exposure_of
+from modeler.fusion.support import exposure_of
 from modeler.types import (
     Array,
     Edge,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from modeler.system.address_space import check_room
+from modeler.system.processes import check_room
 from modeler.types import InputError, Step
 from modeler.viz import entities, viewer
 from modeler.viz.destinations import RecordingFile, Shown

@@ -34,7 +34,7 @@ from modeler.cli.pages import Gallery, Report, View
 from modeler.cli.register import Register
 from modeler.cli.render import Render
 from modeler.cli.suggest import Suggest
-from modeler.system.address_space import check_room, share_one_heap
+from modeler.system.processes import check_room, share_one_heap
 
 Command = (
     Build

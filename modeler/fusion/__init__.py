@@ -1,9 +1,8 @@
 """Fusion of posed depth views into one model of the object: point cloud and mesh."""
 
 from modeler.fusion.alignment import Match, Matcher
-from modeler.fusion.by_focal import widened
 from modeler.fusion.depth_views import conditional_covariances
-from modeler.fusion.fuser import Fuser, FusionVolume
+from modeler.fusion.fuser import Fuser, FusionVolume, widened
 from modeler.fusion.incremental_tsdf import IncrementalTsdf, Preview
 from modeler.fusion.symmetries import Symmetries, SymmetryFinder
 

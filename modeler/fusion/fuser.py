@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,12 +22,11 @@ from modeler.fusion.depth_views import (
     thinning,
     view_blocks,
 )
-from modeler.fusion.distance_field import DistanceField, VoxelGrid, filled, grid_around, measured
-from modeler.fusion.exposure import Exposure, exposure_of
-from modeler.fusion.support import ViewSupport, view_support
+from modeler.fusion.meshing import DistanceField, VoxelGrid, filled, grid_around, measured
+from modeler.fusion.support import Exposure, ViewSupport, exposure_of, view_support
 from modeler.kernels import point_clouds
 from modeler.system.concurrency import in_parallel
-from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
+from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage, Solution
 
 # Exponents of the view weights for colours: an average of views for vertices, nearly one view for textures, where an
 # average blurs. Chosen by hand.
@@ -35,6 +34,7 @@ SOFT, SHARP = 4.0, 16.0
 FOLD_RINGS = 8  # rings of triangles along borders that may fold over; chosen by hand
 MIN_NEIGHBOURS = 6  # points of the cloud with fewer in 27 cells of two voxels are outliers; a plane has some 36
 FINEST_PX = 0.01  # smallest voxel, in pixel footprints: a hundred voxels per pixel resolve nothing
+_MAX_VIEWS = 60  # by which an error of the focal length widens the surface's, spread over a run: more are redundant
 
 
 @dataclass(frozen=True)
@@ -358,3 +358,30 @@ def _outliers(points_m: Array, cell_m: float) -> BoolArray:
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     shape = (np.ceil((high - low) / cell_m) + 1.0).astype(np.int64)
     return point_clouds.neighbour_counts(points_m, low, cell_m, shape) < MIN_NEIGHBOURS
+
+
+def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
+    """Return a model whose vertex uncertainty includes that of the focal length (method, eq. 12.9).
+
+    Args:
+        model: fused under the solution's poses.
+        solution: with the estimate of the focal length; without one, the model is unchanged.
+    """
+    focal, sigmas_m = solution.focal, model.vertex_sigmas_m
+    frames = [] if focal is None else [frame for frame in solution.trajectory if frame in focal.by_focal]
+    if focal is None or sigmas_m is None or not frames:
+        return model
+    vertices_m, normals = model.vertices_m, model.vertex_normals
+    total, weight = np.zeros(len(vertices_m)), np.zeros(len(vertices_m))
+    for place in np.unique(np.linspace(0, len(frames) - 1, _MAX_VIEWS).astype(np.int64)).tolist():
+        object_from_camera, by_focal = solution.trajectory[frames[place]], focal.by_focal[frames[place]]
+        points_m = se3.transform(se3.inverse(object_from_camera), vertices_m)
+        drawn = (points_m * (-1.0, -1.0, 0.0)) @ object_from_camera[:3, :3].T
+        moved = drawn + np.cross(by_focal[:3], vertices_m) + by_focal[3:]
+        rays = object_from_camera[:3, 3] - vertices_m
+        cosines = np.sum(normals * rays, axis=1) / np.linalg.norm(rays, axis=1)
+        share = np.where(cosines >= Fuser.min_cosine, cosines, 0.0)  # what contributes to the mesh
+        total += share * np.sum(normals * moved, axis=1)
+        weight += share
+    by_normal = np.divide(total, weight, out=np.zeros(len(total)), where=weight > 0.0)
+    return replace(model, vertex_sigmas_m=np.hypot(sigmas_m, focal.sigma * by_normal))

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.fusion import meshing
 from modeler.fusion.depth_views import GREY, free_of, posed_views
-from modeler.fusion.distance_field import crossed
 from modeler.fusion.fuser import Fuser
+from modeler.fusion.meshing import crossed
 from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array, ObjectModel, RayImage
 

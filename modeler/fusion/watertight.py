@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from modeler.fusion import meshing
 from modeler.fusion.depth_views import DepthViews, ViewBlocks
-from modeler.fusion.distance_field import FAINT, DistanceField
+from modeler.fusion.meshing import FAINT, DistanceField
 from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
 

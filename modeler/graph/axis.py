@@ -2,6 +2,10 @@
 
 Between consecutive frames target_from_source = A Rz(θ) exp(slip) A⁻¹, with A = camera_from_axis, whose third direction
 is the axis (method, eq. 8.7). A is one variable shared by all steps, so that each pair informs it once.
+
+It pays where the views show no table: over six rendered figurines the largest error falls from 2.28° to 1.90°. With a
+table, or on captures, it does not: dragon, kleenex and cap have 0.61°, 1.42° and 1.08° with it, 0.60°, 1.32° and 0.97°
+without.
 """
 
 from __future__ import annotations
