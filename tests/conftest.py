@@ -62,7 +62,7 @@ def run() -> list[Step]:
 
 @pytest.fixture(scope="session")
 def recording(run: list[Step], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[int, dict[str, Any]]]:
-    """Return what is recorded of that run, as `streamed.read` has it."""
+    """Return what is recorded of that run, as `rerun_recordings.read` has it."""
     from rerun_recordings import record  # and with it Rerun, which few tests need
 
     return record(tmp_path_factory.mktemp("viz") / "recording.rrd", run)

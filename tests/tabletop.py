@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from modeler import se3
-from modeler.types import Array, BoolArray, Camera, Frame, RayImage
+from modeler.types import Array, Camera, Frame, RayImage
 
 CAMERA = Camera(width=200, height=160, fx=240.0, fy=240.0, cx=99.5, cy=79.5)
 DISTANCE_M = 0.8
@@ -139,11 +139,6 @@ def visible(body: Body, poses: list[Array]) -> Array:
         exact = view(body, pose, k)
         parts.append(se3.transform(se3.inverse(pose), exact.points_m))
     return np.concatenate(parts)
-
-
-def inside(points: Array, low: Array, high: Array) -> BoolArray:
-    """Return which points (n, 3) lie in a box."""
-    return np.all((points >= low) & (points <= high), axis=1)
 
 
 def edge_uses(triangles: np.ndarray) -> np.ndarray:

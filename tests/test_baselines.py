@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import small_gicp
 import tabletop
-from input_errors import refused
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -288,14 +287,6 @@ def test_intensity_gradients_are_those_of_the_print(rng: np.random.Generator) ->
 def test_a_lonely_point_has_no_intensity_gradient() -> None:
     cloud = Cloud(np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]]), np.tile([0.0, 0.0, -1.0], (2, 1)), np.array([0.1, 0.9]))
     np.testing.assert_array_equal(intensity_gradients(cloud, KDTree(cloud.points_m), 0.1, 30), 0.0)
-
-
-def test_coloured_icp_refuses_views_without_colour(pair: Pair, rng: np.random.Generator) -> None:
-    source, target = pair
-    density = Normal(np.eye(4), source.centroid_m, 0.05, 0.005)
-    colourless = replace(target, frame=replace(target.frame, colour=None))
-    with refused("frame 1", "colour"):
-        ColouredIcpRegistrar().register(source, colourless, density, rng=rng)
 
 
 def test_gicp_states_its_hessian_in_our_tangent(pair: Pair, rng: np.random.Generator) -> None:

@@ -11,7 +11,7 @@ import tabletop
 from modeler import se3
 from modeler.fusion import Fuser, IncrementalTsdf
 from modeler.kernels import tsdf as kernels
-from modeler.types import Array, InputError, RayImage
+from modeler.types import Array, RayImage
 
 BALL = tabletop.Sphere(0.06)
 POSES = tabletop.turntable(8)
@@ -187,8 +187,3 @@ def test_colours_are_those_of_the_views_and_grey_without(views, trajectory):
     seen = model.vertex_colours[:, 0] != model.vertex_colours[:, 1]
     assert 0.1 < np.mean(seen) < 0.9
     assert {tuple(rgb) for rgb in model.vertex_colours} == {(200, 0, 0), (128, 128, 128)}
-
-
-def test_without_a_pose_there_is_nothing_to_show(views):
-    with pytest.raises(InputError, match="nothing to fuse"):
-        IncrementalTsdf(FUSER).updated(views, {})

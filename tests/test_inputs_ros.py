@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_typestore
 
 from modeler.cli import main
 from modeler.sequences import Overrides, open_sequence
@@ -148,35 +147,6 @@ class Two(Recorder):
     def _colour(self, types, header, colour):
         depth = np.full(colour.shape[:2], 0.7, np.float32)
         return self._image(types, header, "32FC1", depth)
-
-
-def test_realsense_recordings_tell_their_unit(tmp_path: Path, frames: list[Frame]) -> None:
-    sensor = "/device_0/sensor_0/Depth_0"
-    names = {
-        "depth": f"{sensor}/image/data",
-        "info": f"{sensor}/info/camera_info",
-        "colour": "/device_0/sensor_1/Color_0/image/data",
-        "colour_info": "/device_0/sensor_1/Color_0/info/camera_info",
-    }
-    path = RealSense("mono16", names=names).write(tmp_path / "s.bag", frames)
-    sequence = open_sequence(path)
-    assert sequence.depth_unit == "0.25 mm (/device_0/sensor_0/option/Depth Units/value)"
-    assert "by RealSense" in sequence.layout
-    np.testing.assert_allclose(sequence.frame(0).depth_m, frames[0].depth_m * 0.25, rtol=1e-5)
-
-
-class RealSense(Recorder):
-    """Records the sensor's option too."""
-
-    def _fill(self, writer, frames):
-
-        store = get_typestore(Stores.ROS1_NOETIC)
-        unit = writer.add_connection(
-            "/device_0/sensor_0/option/Depth Units/value", "std_msgs/msg/Float32", typestore=store
-        )
-        message = store.types["std_msgs/msg/Float32"](data=0.00025)
-        writer.write(unit, START_NS, bytes(store.serialize_ros1(message, "std_msgs/msg/Float32")))
-        super()._fill(writer, frames)
 
 
 # Lenses

@@ -206,18 +206,6 @@ def test_exposure_and_white_balance_drift_and_pixels_are_noisy() -> None:
     assert images.mean() == pytest.approx(level, rel=0.02)
 
 
-def test_a_seed_decides_photographs_and_the_order_of_reading_nothing() -> None:
-    recipe = replace(load_recipe("tin"), view=replace(VIEW, width=80, height=60))
-    forwards = [RenderedSequence(recipe).frame(index).colour for index in (0, 3)]
-    sequence = RenderedSequence(recipe)
-    backwards = [sequence.frame(index).colour for index in (3, 0)][::-1]
-    for first, second in zip(forwards, backwards, strict=True):
-        assert first is not None
-        np.testing.assert_array_equal(first, second)
-    other = RenderedSequence(replace(recipe, seed=1)).frame(0).colour
-    assert not np.array_equal(forwards[0], other)  # type: ignore[arg-type]
-
-
 def test_photographs_leave_depth_and_motion_alone() -> None:
     recipe = load_recipe("label-box")
     plain = replace(recipe, label=None, photography=None, colour="none")

@@ -20,7 +20,6 @@ from modeler.priors.table import on_plane
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, PoseGaussian, RayImage
 
 every_prior = pytest.mark.parametrize("name", CASES)
-PROPOSALS = [name for name, case in CASES.items() if case.proposes]
 HERE = np.eye(4)
 SOURCE, TARGET = views(HERE)
 CENTRE_M = SOURCE.centroid_m

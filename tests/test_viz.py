@@ -41,7 +41,6 @@ SPREADS = (
     entities.POSITION_3_SIGMA,
     entities.BEFORE_POSITION_3_SIGMA,
 )
-OUTLINES = (entities.OUTLINE, entities.DEPTH_OUTLINE)
 EDGES = (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
 
 
