@@ -12,7 +12,7 @@ from modeler import priors, se3
 from modeler.cli.build import Build
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import AbstractPrior, Outcome
-from modeler.verdict.advice import remedies, unchecked_focal_length, visible_frames
+from modeler.verdict.advice import remedies, unchecked_focal_length
 
 
 def untrusted(
@@ -131,14 +131,3 @@ def test_the_command_to_try_keeps_what_was_given() -> None:
     assert build.command({"prior": "general"}) == "modeler build 'a b' --out run --overwrite --prior general"
     build = Build(Path("a"), Path("run"), where=ObjectOptions(roi=(1, 2, 3, 4)), method=MethodOptions(seed=3))
     assert build.command({}) == "modeler build a --out run --overwrite --roi 1 2 3 4 --seed 3"
-
-
-def test_a_hand_in_half_of_the_frames_does_not_make_the_others_superfluous() -> None:
-    """Where an arm is taken for the object, nothing is found in the frames that show the object alone."""
-
-    def told(of_the_others: Outcome) -> list[dict[str, Any]]:
-        nothing = {"cause": Outcome.TOO_FEW_POINTS.label, "mask": Outcome.TOO_FEW_POINTS.label}
-        return [{"id": k, **(nothing if k < 4 else {"cause": "", "mask": of_the_others.label})} for k in range(8)]
-
-    assert visible_frames(told(Outcome.UNSURE_MASK)) == ""
-    assert "`frames` 4:" in visible_frames(told(Outcome.CONVERGED))

@@ -36,7 +36,6 @@ from modeler.baselines.clouds import (
 from modeler.baselines.coloured_icp import intensity_gradients
 from modeler.experiment import sparse_view
 from modeler.priors import GeneralPrior
-from modeler.registration.features import kabsch, mutual_matches
 from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
 
 BODY = tabletop.Box((0.05, 0.08, 0.035))
@@ -313,28 +312,6 @@ def test_gicp_states_its_hessian_in_our_tangent(pair: Pair, rng: np.random.Gener
     hessian = second_derivative(cost)
     information = np.linalg.inv(found.pose.covariance)  # of the surfaces: the prior's is some 10⁵ times less
     np.testing.assert_allclose(information * variance, hessian, rtol=1e-3, atol=1e-4 * np.max(hessian))
-
-
-def test_kabsch_recovers_motions(rng: np.random.Generator) -> None:
-    poses = se3.exp(rng.normal(size=(40, 6)))
-    triangles = rng.normal(size=(40, 3, 3))
-    carried = triangles @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
-    np.testing.assert_allclose(kabsch(triangles, carried), poses, atol=1e-9)
-
-
-def test_kabsch_never_reflects(rng: np.random.Generator) -> None:
-    mirrored = rng.normal(size=(40, 5, 3))
-    poses = kabsch(mirrored, mirrored * [1.0, 1.0, -1.0])
-    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
-
-
-def test_mutual_matches_are_each_others_nearest(rng: np.random.Generator) -> None:
-    source = rng.normal(size=(40, 33))
-    order = rng.permutation(40)
-    target = source[order] + 1e-3 * rng.normal(size=(40, 33))
-    found = mutual_matches(source, target)
-    np.testing.assert_array_equal(order[found[:, 1]], found[:, 0])
-    assert len(found) == 40
 
 
 def test_features_need_no_start(pair: Pair, rng: np.random.Generator) -> None:

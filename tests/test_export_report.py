@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ring_graphs import OBJECT_M, edge, measured, ring, spin, turntable
+from ring_graphs import OBJECT_M, edge, spin
 from run_builders import META, made_up_steps, strict_json, with_records
 
 from modeler import se3
@@ -17,7 +17,6 @@ from modeler.export import (
     RunFolder,
     edge_record,
     edges_of,
-    g2o_text,
     poses_of,
 )
 from modeler.export.report import undetermined
@@ -315,21 +314,6 @@ def test_report_of_a_run_without_modes_is_read_back() -> None:
     record = edge_record(edge(0, 1, _posterior(SURE_RAD, SURE_M).pose), Solution())
     del record["modes"]
     assert edges_of({"edges": [record]})[0].posterior.modes == ()
-
-
-def test_graph_file_holds_the_mode_that_was_chosen() -> None:
-    rng = np.random.default_rng(1)
-    graph, _ = ring(6, rng, [(0, 5)])
-    first = graph.edges[2]
-    true = measured(turntable(6), first.target, first.source, rng)
-    wrong = PoseGaussian(true.mean @ se3.exp(np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.0])), true.covariance)
-    several = edge(first.target, first.source, wrong, modes=[Mode(0.6, wrong), Mode(0.4, true)])
-    graph = PoseGraph((*graph.edges[:2], several, *graph.edges[3:]))
-    text = g2o_text(graph.edges, solve(graph, {}))
-    (line,) = [
-        line for line in text.splitlines() if line.startswith(f"EDGE_SE3:QUAT {several.target} {several.source}")
-    ]
-    np.testing.assert_allclose(np.array(line.split()[3:6], dtype=np.float64), true.mean[:3, 3])
 
 
 def test_a_posterior_that_is_not_finite_leaves_nothing_to_name():

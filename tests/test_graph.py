@@ -20,7 +20,7 @@ from ring_graphs import turntable as _truth
 from scipy import stats
 
 from modeler import se3
-from modeler.export import g2o_text, tum_text
+from modeler.export import g2o_text
 from modeler.graph import PoseGraph, solve
 from modeler.types import Array, Mode, PoseGaussian
 
@@ -257,7 +257,7 @@ def test_a_closure_that_comes_before_odometry_of_the_same_frames_does_not_bear_i
     assert all(np.allclose(solution.trajectory[frame], pose) for frame, pose in chain.items())
 
 
-# What a solved graph writes is read by others as it was meant: GTSAM takes graph.g2o, evo takes trajectory.txt.
+# What a solved graph writes is read by GTSAM as it was meant.
 
 
 def _graph() -> PoseGraph:
@@ -293,16 +293,3 @@ def test_solved_graph_is_the_optimum_of_its_own_file(tmp_path: Path) -> None:
     assert factors.error(best) == pytest.approx(error, rel=1e-4)
     for frame, pose in solution.trajectory.items():
         np.testing.assert_allclose(best.atPose3(frame).matrix(), pose, atol=1e-4)
-
-
-def test_trajectory_passes_the_checks_of_evo() -> None:
-    """`evo_traj tum FILE --full_check` (1.38): eight columns, rising times, unit quaternions, rigid matrices."""
-    solution = solve(_graph(), {})
-    times_s = {frame: 1305031102.0 + frame / 30.0 for frame in solution.trajectory}
-    columns = np.array([line.split(" ") for line in tum_text(solution.trajectory, times_s).splitlines()], dtype=float)
-    assert columns.shape == (12, 8)
-    assert np.all(np.diff(columns[:, 0]) > 0.0)
-    np.testing.assert_allclose(np.linalg.norm(columns[:, 4:], axis=1), 1.0, atol=1e-12)
-    for pose in solution.trajectory.values():
-        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
-        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
