@@ -19,8 +19,8 @@ from modeler.baselines.clouds import (
     plane_residuals,
     whitened_jacobian,
 )
-from modeler.baselines.icp import IcpRegistrar
-from modeler.registration.features import fpfh, kabsch, mutual_matches
+from modeler.baselines.icp import FINE, IcpRegistrar
+from modeler.registration.features import FeatureMatcher, fpfh, kabsch, mutual_matches
 from modeler.types import Array, RayImage
 
 _SAMPLE_SIZE = 3  # correspondences that determine a motion
@@ -40,7 +40,7 @@ class FpfhRegistrar(AbstractCloudRegistrar):
 
     voxel: float = 1 / 40
     """Voxel edge, as a fraction of the object's size."""
-    feature_radius: float = 5.0
+    feature_radius: float = FeatureMatcher.feature_radius
     """Radius of a feature's neighbourhood, in voxels."""
     reach: float = 1.5
     """Largest distance of correspondences, in voxels."""
@@ -141,7 +141,7 @@ class FpfhIcpRegistrar(AbstractCloudRegistrar):
 
     fpfh: FpfhRegistrar = field(default_factory=FpfhRegistrar)
     """The global search."""
-    icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=(1 / 32, 1 / 64)))
+    icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=FINE))
     """The refinement, without coarse levels, which could leave the basin of a good initial pose."""
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:

@@ -23,6 +23,7 @@ from modeler.baselines.clouds import (
 from modeler.types import Array, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
+FINE = (1 / 32, 1 / 64)  # voxels that start from a global registration, in sizes of the object
 _DAMPING = 1e-9  # relative to the mean curvature; only fixes unobservable directions
 
 

@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 
 from modeler.baselines.clouds import AbstractCloudRegistrar, Cloud, Fit, cube_edges_m
-from modeler.baselines.icp import IcpRegistrar
+from modeler.baselines.icp import FINE, IcpRegistrar
 from modeler.types import Array, InputError, RayImage
 
 MISSING = "KISS-Matcher is not installed; install it with: pip install -c constraints.txt -e '.[peers]'"
@@ -36,7 +36,7 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
 
     voxel: float = 1 / 40
     """Voxel edge, as a fraction of the object's size."""
-    icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=(1 / 32, 1 / 64)))
+    icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=FINE))
     """The refinement, without coarse levels, which could leave the basin of a good initial pose."""
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:

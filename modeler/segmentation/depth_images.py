@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
+from scipy.special import ndtri
 
 from modeler.types import Array, BoolArray, Camera, Float32Array
 
@@ -20,7 +21,6 @@ HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an im
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
 _OUTLIERS_IN = 7  # one measurement in this many may be false; where more lie before the background, something moved
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
-_QUARTERS_APART = 1.35  # standard deviations from the lower to the upper quartile of a Gaussian
 Labels = npt.NDArray[np.int32]
 _JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
 _GRID_CELLS = 80  # largest number of voxels along a side
@@ -145,7 +145,8 @@ def noise_ratio(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNo
         return 1.0
     quarters = [(np.float32(share) * (readings - 1)).round().astype(np.int64) for share in (0.25, 0.5, 0.75)]
     low, middle, high = (np.take_along_axis(stack, place[None], axis=0)[0][often] for place in quarters)
-    return float(np.median((high - low) / (_QUARTERS_APART * noise.sigma_m(middle))))
+    apart = 2.0 * ndtri(0.75)  # standard deviations from the lower to the upper quartile of a Gaussian
+    return float(np.median((high - low) / (apart * noise.sigma_m(middle))))
 
 
 def _sorted(depths_m: Sequence[Float32Array], stride: int) -> tuple[Float32Array, npt.NDArray[np.int64]]:

@@ -20,7 +20,6 @@ _SYSTEMATIC_OFFSET_M = 0.0005
 _SYSTEMATIC_SHARE = 0.001  # scale error of the depth, relative to the distance of the foot
 _MIN_POINTS = 50  # of a plane, and of the ground seen on it
 _TRIM = 3.0  # standard deviations
-_ROUNDING_M = 1e-6
 _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
 _LEAST_BLOCKS = 6
 _CELL_PX = 5
@@ -73,7 +72,7 @@ def fit_plane(
     uv = (near - centre) @ axes.T
     residual = heights(near, plane)
     narrow = np.sqrt(max(np.linalg.eigvalsh(np.cov(uv.T))[0], 0.0))
-    if narrow < _TRIM * residual.std() or narrow < _ROUNDING_M:
+    if narrow < max(_TRIM * residual.std(), _SYSTEMATIC_OFFSET_M):
         return None
     covariance = _sandwich(uv, residual, weight) + _warp(uv, residual, weight)
     foot = centre if foot_m is None else foot_m
