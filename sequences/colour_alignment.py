@@ -135,13 +135,7 @@ def _step(width: int) -> int:
 
 def _edges(frame: Frame, colour: npt.NDArray[np.uint8]) -> tuple[Array, Array]:
     """Return the edges of depth and of colour, shrunk; those of colour less their surroundings' mean."""
-    inverse = 1.0 / np.where(frame.depth_m > 0.0, frame.depth_m, np.nan).astype(np.float64)
-    bends = np.zeros(inverse.shape, dtype=np.bool_)
-    for axis in (0, 1):
-        bent = np.abs(np.roll(inverse, 1, axis) + np.roll(inverse, -1, axis) - 2.0 * inverse)
-        with np.errstate(invalid="ignore"):
-            bends |= bent > _EDGE * inverse
-    bends[[0, -1]] = bends[:, [0, -1]] = False  # rolled around
+    bends = depth_edges(frame.depth_m)
     slope = np.zeros(colour.shape[:2])
     for channel in range(3):
         smooth = ndimage.gaussian_filter(colour[..., channel].astype(np.float64), 1.0)
@@ -150,6 +144,18 @@ def _edges(frame: Frame, colour: npt.NDArray[np.uint8]) -> tuple[Array, Array]:
     step = _step(frame.depth_m.shape[1])
     seen = _shrunk(steep, step)
     return np.minimum(_shrunk(bends.astype(np.float64), step), 0.5), seen - np.asarray(ndimage.gaussian_filter(seen, 8))
+
+
+def depth_edges(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Return the pixels (h, w) at which measured depth bends or jumps."""
+    inverse = 1.0 / np.where(depth_m > 0.0, depth_m, np.nan).astype(np.float64)
+    bends = np.zeros(inverse.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        bent = np.abs(np.roll(inverse, 1, axis) + np.roll(inverse, -1, axis) - 2.0 * inverse)
+        with np.errstate(invalid="ignore"):
+            bends |= bent > _EDGE * inverse
+    bends[[0, -1]] = bends[:, [0, -1]] = False  # rolled around
+    return bends
 
 
 def _shrunk(image: Array, step: int) -> Array:

@@ -6,7 +6,7 @@ import io
 import re
 import zipfile
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -146,6 +146,22 @@ def depth_size(path: Path) -> tuple[int, int]:
         return image_size(path)
     height, width = read_depth(path).shape
     return width, height
+
+
+_SMOOTHER: Final = 4.0
+
+
+def is_swapped(raw: RawDepth) -> bool:
+    """Return whether whole numbers have their two bytes exchanged: neighbours are much more alike once they are not."""
+    if raw.dtype != np.uint16:
+        return False
+
+    def roughness(values: npt.NDArray[Any]) -> float:
+        left, right = values[:, :-1].astype(np.int64), values[:, 1:].astype(np.int64)
+        both = (left > 0) & (right > 0)
+        return float(np.abs(left - right)[both].mean()) if both.any() else 0.0
+
+    return roughness(raw) > _SMOOTHER * roughness(raw.byteswap()) > 0.0
 
 
 def float_unit_mm(raw: RawDepth) -> float | None:

@@ -18,6 +18,7 @@ from modeler.sequences.depth_files import (
     check_same_size,
     depth_size,
     float_unit_mm,
+    is_swapped,
     metres,
     no_depth,
     read_depth,
@@ -45,7 +46,7 @@ from modeler.sequences.input_files import (
     list_images,
     read_text,
 )
-from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, find_intrinsics
+from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, cameras_of_frames, find_intrinsics
 from modeler.sequences.lens import Lens
 from modeler.sequences.recording import AbstractRecording, paired
 from modeler.types import Array, Camera, Frame, InputError
@@ -412,6 +413,8 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
     depth, first = found.depth, next(iter(found.depth.values()))
     size = depth_size(first)
     facts = find_intrinsics(path, overrides)
+    each = cameras_of_frames(path, depth, size) if facts is None else {}
+    facts = next(iter(each.values()), facts)
     if facts is None and _is_seven_scenes(first) and size == (640, 480):
         facts = CameraFacts(SEVEN_SCENES, "7-Scenes")
     if facts is None:
@@ -449,11 +452,20 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
             masks.get(stem),
             occluders.get(stem),
             confidence.get(stem),
+            each[stem].intrinsics if each else None,
         )
         for stem, image in depth.items()
     }
     unit_mm, who = facts.unit(overrides, (1.0, "the default"))
-    if overrides.depth_scale_mm is None and (float_mm := float_unit_mm(read_depth(first))) is not None:
+    raw = read_depth(first)
+    if is_swapped(raw):
+        raise InputError(
+            f"{first}: has the two bytes of its values exchanged: neighbouring pixels differ less once they are "
+            "swapped back; save depth again, in the byte order that the format demands."
+        )
+    if raw.dtype == np.uint16 and (nothing := float(np.mean(raw == np.iinfo(np.uint16).max))) > 0.0:
+        remarks.append(f"65535, {nothing:.1%} of the first depth image, stands for no measurement")
+    if overrides.depth_scale_mm is None and (float_mm := float_unit_mm(raw)) is not None:
         unit_mm, who = float_mm, "by its values"
     return ImageFolderSequence(
         path,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
@@ -77,7 +78,7 @@ NAMES = (
     "metadata",
 )
 """Files that are looked for, in this order; after them, files of YAML (OpenCV, ROS, ORB-SLAM, Kalibr)."""
-OF_COLOUR = ("camera_matrix.csv", "transforms.json", "metadata.json", "metadata")
+OF_COLOUR = ("camera_matrix.csv", "transforms.json", "metadata.json", "metadata", "cameras/")
 """Of phones: intrinsics of colour images, whose view depth has in fewer pixels."""
 _PHONE_SIZE = (1920, 1440)
 """Images of Stray Scanner, whose file does not state their size."""
@@ -169,7 +170,7 @@ def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
             node = read_tree(path)
             if (path in others or path.name in OF_COLOUR) and not _describes_camera(node):
                 continue  # whatever else has such a name
-            return _from_tree(node, path.name)
+            return camera_of(node, path.name)
         found = _from_text(path)
         return replace(found, size=_phone_size(found)) if path.name in OF_COLOUR else found
     return None
@@ -223,8 +224,16 @@ def _describes_camera(node: Node) -> bool:
     return bool(keys & {"fl_x", "fx", "Camera.fx", "Camera1.fx", "cam0", *_MATRICES, *_WITHIN})
 
 
-def _from_tree(node: Node, name: str) -> CameraFacts:
-    """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name."""
+def camera_of(node: Node, name: str) -> CameraFacts:
+    """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name.
+
+    Args:
+        node: the contents of a file.
+        name: of the file.
+
+    Raises:
+        InputError: if it describes no camera.
+    """
     scale = _first(node, _SCALES)
     node = next((within for key in ("cam0", *_WITHIN) if (within := _inner(node, key)) is not None), node)
     width, height = _first(node, _WIDTHS), _first(node, _HEIGHTS)
@@ -238,6 +247,23 @@ def _from_tree(node: Node, name: str) -> CameraFacts:
         _distortion(node),
         model.value if model is not None and isinstance(model.value, str) else "",
     )
+
+
+def cameras_of_frames(path: Path, stems: Iterable[str], size: tuple[int, int]) -> dict[str, CameraFacts]:
+    """Return the camera of each image by its name, as Polycam writes them beside its images; {} without.
+
+    Args:
+        path: the folder.
+        stems: names of the depth images.
+        size: (width, height) of depth, which may have fewer pixels than the images the cameras are of.
+
+    Raises:
+        InputError: if a file of a camera cannot be read.
+    """
+    files = {stem: path / "cameras" / f"{stem}.json" for stem in stems}
+    if not all(map(is_there, files.values())):
+        return {}
+    return {stem: camera_of(read_tree(file), "cameras/").scaled(size) for stem, file in files.items()}
 
 
 def _first(node: Node, keys: tuple[str, ...]) -> Node | None:

@@ -22,6 +22,7 @@ from modeler.sequences.image_folders import (
 from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import SCHEME, open_camera
+from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.ray_distance import AxialSequence
 from modeler.system.regular_files import check_regular
 from modeler.types import InputError
@@ -84,6 +85,8 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
         from modeler.sequences.kinect import open_kinect
 
         return open_kinect(path, overrides)
+    if path.is_file() and path.suffix.lower() == ".r3d":
+        return open_record3d(path, overrides)
     if (path.is_file() and path.suffix.lower() in CLOUD_SUFFIXES) or _holds_clouds(path):
         return open_clouds(path, overrides)
     if not path.is_dir():
@@ -92,6 +95,10 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
         return BopSequence(path, overrides)
     if is_there(path / "depth.txt"):
         return open_tum(path, overrides)
+    if (path / "keyframes" / "depth").is_dir():  # Polycam's
+        path = path / "keyframes"
+    if (listed := images_of_transforms(path)) is not None:
+        return open_colour_depth(path, listed, overrides)
     if first_folder(path, DEPTH_FOLDERS) is not None:
         return open_colour_depth(path, images_in_folders(path), overrides)
     if (found := images_in_one_folder(path)) is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -71,6 +73,8 @@ class Survey:
     """Number of frames with colour."""
     truths: int | None
     """Number of frames with a true pose; None if not checked."""
+    digests: Mapping[int, str] = field(default_factory=dict)
+    """Of the images and the camera of each frame, by its number."""
     flat: tuple[float, float] = (0.0, 0.0)
     """Shares (0..1) of the pixels on the largest plane if depth is along the optical axis, and if along the ray."""
     misaligned: Misalignment | None = None
@@ -178,7 +182,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
     cameras: dict[Camera, None] = {}
     times_s, ranges, shares, joined, farthest_m = [], [], [], [], 0.0
     empty, empty_masks, repeated, masks, colours = [], [], [], 0, 0
-    before_m, inspected = None, []
+    before_m, inspected, digests = None, [], {}
     every = max(1, (len(sequence) - 1) // (INSPECTED - 1))
     for place, frame in enumerate(sequence):
         if place % every == 0 and len(inspected) < INSPECTED:
@@ -186,6 +190,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         if frame.camera not in cameras:
             cameras[_checked(sequence, frame.camera)] = None
         times_s.append(frame.time_s)
+        digests[frame.index] = _digest(frame)
         pixels = measured_pixels(frame)
         measured = frame.depth_m[pixels]
         shares.append(measured.size / frame.depth_m.size)
@@ -225,6 +230,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         empty_masks=tuple(empty_masks),
         colours=colours,
         truths=(0 if poses is None else len(poses)) if truth else None,
+        digests=digests,
         flat=flat_shares(inspected),
         misaligned=misalignment([frame for frame in inspected if frame.camera == inspected[0].camera]),
     )
@@ -271,6 +277,13 @@ def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
         f"{sequence.name}: half of the depth lies within {middle_m:.3g} m where one unit is {sequence.depth_unit}: "
         f"it looks like {guess}; correct the depth scale{factor}, or convert with `depth_scale_mm`."
     )
+
+
+def _digest(frame: Frame) -> str:
+    digest = hashlib.blake2b(repr(frame.camera).encode(), digest_size=8)
+    for image in (frame.depth_m, frame.mask, frame.colour, frame.occluder):
+        digest.update(b"none" if image is None else np.ascontiguousarray(image).tobytes())
+    return digest.hexdigest()
 
 
 def _on_colour(found: Misalignment) -> str:

@@ -80,7 +80,7 @@ class Build:
         _check(self)
         inputs = [path for path in (self.sequence, self.model.sensor, self.model.camera) if path is not None]
         check_run_folder(self.out, inputs, overwrite=self.overwrite, resume=self.resume)
-        whole, frames = _opened(self)
+        whole, frames, digests = _opened(self)
         modeler = compose.modeler(whole, self.prior, self.method, self.where)
         modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.model.voxel_m))
         prior, remark = compose.resolved_prior(self.prior, whole)
@@ -90,11 +90,14 @@ class Build:
             prior=prior,
             settings=self.settings(),
             camera=estimated_camera(self.model.camera),
+            digests=digests,
         )
         if self.resume and RunFolder(self.out).finished(meta):
             RunFolder(self.out).pairs.drop()  # left over from a kill at the very end
             say("the run is already complete; give --overwrite to build it again")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
+        if self.resume and (changes := RunFolder(self.out).changed_frames(meta)):
+            say(f"{', '.join(changes)} since the run: frames are registered with them, from what is kept of it")
         compile_kernels(say)
         scene, _ = in_parallel(partial(compose.scene, modeler, whole), load)
         with alone(self.out):
@@ -161,8 +164,8 @@ def _check(options: Build) -> None:
         reachable(options.connect)  # rejects invalid addresses; the connection is made with the first data
 
 
-def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
-    """Return the sequence and the selected frames; unreadable input is found before anything is created.
+def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence, Mapping[int, str]]:
+    """Return the sequence, the selected frames and their digests; what is unreadable is found before anything is made.
 
     Raises:
         InputError: if something cannot be read.
@@ -177,6 +180,7 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
     whole = whole if whole.live else KeptSequence(whole)
     whole = calibrated(whole, options.model.sensor, options.model.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
+    digests: Mapping[int, str] = {}
     if not frames.live:
         found = survey(frames, truth=False)
         found.check(frames.name, despite_doubts=options.given.despite_doubts)
@@ -184,7 +188,8 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence]:
             raise InputError(f"{path}: has no colour, which coloured ICP compares; give another --method")
         for doubt in found.doubts:
             say(doubt)
-    return whole, frames
+        digests = found.digests
+    return whole, frames, digests
 
 
 def _run(

@@ -10,6 +10,7 @@ import tyro
 
 from modeler.cli.console import as_options
 from modeler.cli.options import InputOptions
+from modeler.composition.options import default
 
 if TYPE_CHECKING:
     from modeler.sequences import AbstractSequence, Survey
@@ -27,6 +28,8 @@ class Info:
     """A sequence in any format that `modeler build` takes; the format is detected from the path."""
     json: bool = False
     """Print a JSON object instead of lines."""
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png"), default("none")] = None
+    """Write a picture of the first and the middle frame: depth, its edges over colour, and the mask."""
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
@@ -38,11 +41,18 @@ class Info:
         from json import dumps
 
         from modeler.cli.reading import reading
+        from modeler.runs.outputs import check_files
         from modeler.sequences import open_sequence, survey
+        from modeler.sequences.survey_picture import write_picture
 
+        if self.picture is not None:
+            check_files([self.picture], [self.input], overwrite=True)
         sequence = open_sequence(self.input, self.given.overrides())
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
+        if self.picture is not None:
+            middle = sequence.indices[len(sequence.indices) // 2]
+            write_picture(self.picture, [sequence.frame(index) for index in (sequence.indices[0], middle)])
         if self.json:
             print(as_options(dumps(record(sequence, found), allow_nan=False)))
         else:
@@ -103,8 +113,13 @@ def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
         lines.append(("sensor noise", f"{sensor[0]:.3g} across (w, h), {sensor[1] * 1000.0:.3g} mm along the ray"))
     if motion is not None:
         lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
+    lines += [("doubt", what) for what in found.doubts]
     lines += [("missing", what) for what in found.missing]
-    return lines + [("note", note) for note in (*found.doubts, *sequence.notes)]
+    lines += [("note", note) for note in sequence.notes]
+    if found.doubts or sequence.notes:
+        override = "--intrinsics, --depth-scale-mm, --along-ray and --despite-doubts, here as for build and convert"
+        lines.append(("to override", override))
+    return lines
 
 
 def _sizes(cameras: tuple[Camera, ...]) -> list[tuple[int, int]]:

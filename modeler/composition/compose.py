@@ -221,8 +221,15 @@ def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
     return kind if fits and kind in enough and enough[kind]() else otherwise
 
 
+_TURN_DEG = 180.0  # no table turns farther from frame to frame
+
+
 def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
-    """Return the name of the prior, and in words the assumptions not given by an option."""
+    """Return the name of the prior, and in words the assumptions not given by an option.
+
+    Raises:
+        InputError: if the frames would be half a turn or more apart.
+    """
     name, assumed = prior_name(options, sequence), []
     if options.prior is None and name not in ("auto", "general"):
         assumed.append(f"prior {name}, from sequence.json")
@@ -231,6 +238,11 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
         assumed.append(f"step {step_deg:g}°, from sequence.json")
     step_deg = step_deg if options.step_deg is None else options.step_deg
     apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
+    if "turntable" in name.split("+") and step_deg is not None and apart > 1 and apart * abs(step_deg) > _TURN_DEG:
+        raise InputError(
+            f"--step-deg {step_deg:g} is from one frame number to the next, and these go up by {apart}, as angles in "
+            f"names do: frames would be {apart * step_deg:g}° apart; if the names are angles, give --step-deg 1"
+        )
     if "turntable" in name.split("+") and step_deg is not None and apart > 1:
         assumed.append(
             f"frame numbers go up by {apart}: {step_deg:g}° from one number to the next is {apart * step_deg:g}° from "

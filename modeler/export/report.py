@@ -61,6 +61,8 @@ class RunMeta:
     `depth_scale_sigma` and `told_by`; None: the given one is exact."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time in s by part of the program."""
+    digests: Mapping[int, str] = field(default_factory=dict)
+    """Of the images and the camera of each frame, by its number; empty where they are not known beforehand."""
     versions: Mapping[str, str] = field(default_factory=_versions)
     """Version by package."""
 
@@ -85,6 +87,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         "settings": dict(meta.settings),
         "versions": dict(meta.versions),
         "seconds": dict(meta.seconds),
+        "digests": {str(index): digest for index, digest in meta.digests.items()},
         "complete": step.last and "interrupted" not in verdict.codes,
         "closed": loops_closed(_taking_part(step)) > 0,
         "loop": _loop(step.edges_so_far, solution, views),

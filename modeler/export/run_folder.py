@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -172,7 +173,24 @@ class RunFolder:
                     f"{self.path}: cannot resume, {name.replace('_', '-')} was {was} and is now {is_now}; "
                     "use the same, or build the run again"
                 )
-        return report.get("complete") is True and not self.pairs.folder.exists()
+        return report.get("complete") is True and not self.pairs.folder.exists() and not self.changed_frames(meta)
+
+    def changed_frames(self, meta: RunMeta) -> tuple[str, ...]:
+        """Return in words which frames are new, other ones, or gone since a run was made; none where that is not known.
+
+        Raises:
+            InputError: if its report cannot be read.
+        """
+        before = self.report().get("digests") if (self.path / _REPORT).exists() else None
+        if not isinstance(before, dict) or not before or not meta.digests:
+            return ()
+        now = {str(index): digest for index, digest in meta.digests.items()}
+        kinds = {
+            "new": now.keys() - before.keys(),
+            "changed": {name for name in now.keys() & before.keys() if now[name] != before[name]},
+            "gone": before.keys() - now.keys(),
+        }
+        return tuple(f"{_listed(names)} {what}" for what, names in kinds.items() if names)
 
     def changed_versions(self, meta: RunMeta) -> tuple[str, ...]:
         """Return the packages, each with its version, with which a run was begun that is to be resumed with others.
@@ -231,3 +249,12 @@ class RunFolder:
                 self.pairs.drop()
             except OSError as error:
                 raise InputError(f"{self.pairs.folder}: cannot be removed ({error.strerror}); remove it") from error
+
+
+def _listed(numbers: Collection[str]) -> str:
+    """Return frame numbers in words, as in `frames 10 to 14 (5) are`."""
+    known = sorted(int(number) for number in numbers if number.isdecimal())
+    if len(known) == 1:
+        return f"frame {known[0]} is"
+    some = ", ".join(map(str, known)) if len(known) <= 5 else f"{known[0]} to {known[-1]} ({len(known)})"
+    return f"frames {some} are"
