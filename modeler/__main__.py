@@ -15,6 +15,10 @@ def main() -> int:
         return run()
     except KeyboardInterrupt:  # before the command could handle it
         return 128 + signal.SIGINT
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # all is done
+            if signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, signal.SIG_DFL)
 
 
 if __name__ == "__main__":

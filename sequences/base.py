@@ -281,9 +281,9 @@ def frame_range(text: str) -> slice:
     Raises:
         InputError: if the text is no such range.
     """
-    match = re.fullmatch(r"([0-9]*):([0-9]*)", text.strip())
+    match = re.fullmatch(r"([0-9]{0,18}):([0-9]{0,18})", text.strip())
     if match is None:
-        raise InputError(f"`frames` {text!r} is not a range of frame numbers; write A:B, for instance 0:14.")
+        raise InputError(f"`frames` {text[:99]!r} is not a range of frame numbers; write A:B, for instance 0:14.")
     start, stop = (int(end) if end else None for end in match.groups())
     return slice(start, stop)
 

@@ -22,7 +22,7 @@ import pytest
 from command_runner import BOX, QUICK
 
 from modeler.cli import main
-from modeler.cli.console import Console, Interrupt, as_options
+from modeler.cli.console import Console, Interrupt, as_options, endable
 from modeler.cli.info import Info
 from modeler.cli.reading import reading
 from modeler.composition.compose import check_region
@@ -261,6 +261,97 @@ def test_a_program_that_calls_a_command_handles_its_signals_again(capfd: pytest.
         for number, handler in before.items():
             signal.signal(number, handler)
     capfd.readouterr()
+
+
+def test_settings_for_developers_of_libraries_change_nothing(tmp_path: Path) -> None:
+    settings = {"OPT": "9", "CPU_NAME": "nonsense", "THREADING_LAYER": "nonsense", "DEBUG": "1", "DUMP_IR": "1"}
+    (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\nnum_threads: nonsense\n")
+    said = []
+    for place, changed in ((Path.cwd(), {}), (tmp_path, settings)):
+        ended = subprocess.run(
+            [*COMMAND, "register", BOX, "0", "1", *QUICK],
+            cwd=place,
+            env={**os.environ, **{f"NUMBA_{name}": value for name, value in changed.items()}, "RERUN": "nonsense"},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=200.0,
+        )
+        said.append(
+            (ended.returncode, re.sub('"seconds": .*', "", ended.stdout), re.sub("[0-9.]+ s", "", ended.stderr))
+        )
+    assert said[0] == said[1]
+    assert said[0][0] == 0
+
+
+def test_too_few_files_are_said_in_one_line() -> None:
+    limited = 'ulimit -n 20; exec "$@"'
+    ended = subprocess.run(
+        ["bash", "-c", limited, "-", *COMMAND, "info", BOX], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert "ulimit -n" in ended.stderr
+
+
+def test_numbers_of_thousands_of_digits_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["build", BOX, "--out", str(tmp_path / "run"), "--frames", "0:" + "9" * 5000]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+
+
+ENDINGS = [
+    (signal.SIGINT, KeyboardInterrupt, None),
+    (signal.SIGTERM, SystemExit, 143),
+    (signal.SIGHUP, SystemExit, 129),
+]
+
+
+@pytest.mark.parametrize(("number", "kind", "status"), ENDINGS)
+def test_a_signal_that_a_library_turns_into_another_error_ends_the_command(
+    number: int, kind: type[BaseException], status: int | None
+) -> None:
+    def load() -> None:
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(10.0)
+        except BaseException:
+            raise RuntimeError("the library failed") from None
+
+    with pytest.raises(kind) as ending, endable():
+        load()
+    assert getattr(ending.value, "code", None) == status
+
+
+@pytest.mark.parametrize(("number", "kind", "status"), ENDINGS)
+def test_a_signal_where_nothing_can_be_raised_ends_the_command(
+    number: int, kind: type[BaseException], status: int | None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    class Dropped:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), number)
+            time.sleep(0.1)
+
+    def drop() -> None:
+        Dropped()
+        time.sleep(10.0)
+
+    with pytest.raises(kind), endable():
+        drop()
+    assert capfd.readouterr().err == ""
+
+
+def test_a_terminal_that_closes_leaves_nothing_half_written(tmp_path: Path) -> None:
+    """SIGHUP in the middle of writing."""
+    program = (
+        "import os, signal, sys; from modeler.cli import main; from modeler.sequences import image_files\n"
+        "def hung_up(path, pixels): os.kill(os.getpid(), signal.SIGHUP); write(path, pixels)\n"
+        "write, image_files.write_image = image_files.write_image, hung_up\n"
+        "from modeler.sequences import bop; bop.write_image = hung_up\n"
+        "sys.exit(main(['convert', sys.argv[1], '--out', sys.argv[2]]))"
+    )
+    arguments = [sys.executable, "-c", program, BOX, str(tmp_path / "out")]
+    ended = subprocess.run(arguments, capture_output=True, text=True, check=False, timeout=60.0)
+    assert (ended.returncode, ended.stderr) == (129, "")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_command_runs_in_any_thread(capfd: pytest.CaptureFixture[str]) -> None:

@@ -386,9 +386,9 @@ def processor_s(process: int) -> float:
 
 def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_path: Path) -> None:
     program = (
-        "import sys, pathlib, time; from modeler.cli.console import terminable; from turning_box import steps;"
+        "import sys, pathlib, time; from modeler.cli.console import endable; from turning_box import steps;"
         "from modeler.viz.stream import open_stream\n"
-        "with terminable():\n"
+        "with endable():\n"
         "    stream = open_stream('box', save=pathlib.Path(sys.argv[1]), web=True)\n"
         "    try:\n"
         "        stream(next(steps(1)))\n"

@@ -11,7 +11,9 @@ import io
 import logging
 import os
 import re
+import resource
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
@@ -24,7 +26,7 @@ import tyro
 from modeler.cli.batch import Batch
 from modeler.cli.build import Build
 from modeler.cli.calibrate import CalibrateCamera, CalibrateSensor
-from modeler.cli.console import INTERRUPTED, interruptible_at_once, say, terminable, worded_as_options
+from modeler.cli.console import INTERRUPTED, endable, say, worded_as_options
 from modeler.cli.convert import Convert
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
@@ -82,6 +84,8 @@ _DESCRIPTION = (
     "--version prints the version."
 )
 _ROOM = 7 * 2**27  # bytes of addresses that registering two frames takes, a third of them used
+_FILES = 256  # open at the same time: Rerun ends the process where it cannot open its own
+_THREAD_DIGITS = 3
 _HELP_INDENT = " " * 8  # of an option's description in the parser's error box
 
 
@@ -192,11 +196,12 @@ def _run(command: Command) -> int:
     """Run a command and return its exit status; unusable input is reported in one line."""
     _check_environment()
     check_room(_ROOM)
-    with interruptible_at_once():
+    with endable():
+        _import_numba()
         importlib.import_module("modeler.viz.viewer" if isinstance(command, View) else "modeler.cli.reading")
         from modeler.types import InputError
     try:
-        with terminable():
+        with endable():
             _check_names(command)
             return command.run()
     except InputError as error:
@@ -204,19 +209,44 @@ def _run(command: Command) -> int:
         return 2
 
 
+def _import_numba() -> None:
+    """Import Numba without the settings that it looks for in the current folder, in a file of YAML."""
+    modules: dict[str, Any] = sys.modules
+    if "numba" in modules or not os.path.lexists(".numba_config.yaml"):
+        return
+    yaml, modules["yaml"] = modules.get("yaml"), None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            importlib.import_module("numba")
+    finally:
+        del modules["yaml"]
+        if yaml is not None:
+            modules["yaml"] = yaml
+
+
 def _check_environment() -> None:
-    """Reject settings of numba under which nothing can be computed.
+    """Reject settings under which nothing can be computed, and drop those for developers of the libraries.
 
     Raises:
         SystemExit: with status 2 and one line on stderr.
     """
     threads, interpreted = (os.environ.get(f"NUMBA_{name}", "") for name in ("NUM_THREADS", "DISABLE_JIT"))
-    if threads and not (threads.isdecimal() and int(threads) > 0):
-        say(f"NUMBA_NUM_THREADS={threads} is not a number of threads; set it to 1 or more, or unset it")
+    if threads and not (threads.isdecimal() and len(threads) <= _THREAD_DIGITS and int(threads) > 0):
+        say(f"NUMBA_NUM_THREADS={threads[:99]} is not a number of threads; set it to 1 or more, or unset it")
         raise SystemExit(2)
     if interpreted not in ("", "0"):
         say(f"NUMBA_DISABLE_JIT={interpreted} would leave the kernels uncompiled; unset it")
         raise SystemExit(2)
+    for name in [name for name in os.environ if name.startswith(("NUMBA_", "RERUN"))]:
+        if name not in ("NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR"):
+            del os.environ[name]
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < _FILES:
+        say(f"{hard} open files are too few; allow {_FILES} or more (ulimit -n)")
+        raise SystemExit(2)
+    if soft < _FILES:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (_FILES, hard))
 
 
 def _check_names(options: Any) -> None:

@@ -25,8 +25,7 @@ T = TypeVar("T")
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the convention of shells."""
-TERMINATED = 128 + signal.SIGTERM
-"""Exit status after SIGTERM, by the convention of shells."""
+_AGAIN_S = 0.05  # until a signal is sent again that arrived where nothing can be raised
 _ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
 
@@ -74,13 +73,6 @@ def lost_without_harm() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def interruptible_at_once() -> Iterator[None]:
-    """Let Ctrl-C end the program immediately during imports: libraries turn it into other errors."""
-    with _handled(signal.SIGINT, _quit):
-        yield
-
-
-@contextlib.contextmanager
 def _handled(number: signal.Signals, handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     """Handle a signal in the block, then restore the previous handler; no effect outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
@@ -93,20 +85,48 @@ def _handled(number: signal.Signals, handler: Callable[[int, FrameType | None], 
         signal.signal(number, signal.SIG_DFL if before is None else before)  # None: not set by Python
 
 
-def _quit(number: int, frame: FrameType | None) -> None:
-    say("interrupted")
-    os._exit(INTERRUPTED)
-
-
 @contextlib.contextmanager
-def terminable() -> Iterator[None]:
-    """Let SIGTERM end the program like an exception, so that it cleans up."""
-    with _handled(signal.SIGTERM, _leave):
+def endable() -> Iterator[None]:
+    """Let Ctrl-C, SIGTERM and SIGHUP end the block like an exception, so that it cleans up.
+
+    Compiled code and libraries turn that exception into others, or drop it where nobody can handle it.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C.
+        SystemExit: after another of these signals, with 128 and its number.
+    """
+    if threading.current_thread() is not threading.main_thread():  # others get no signals
         yield
+        return
+    got: list[int] = []
+    otherwise = sys.unraisablehook
 
+    def ending() -> BaseException:
+        return KeyboardInterrupt() if got[-1] == signal.SIGINT else SystemExit(128 + got[-1])
 
-def _leave(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(TERMINATED)
+    def end(number: int, frame: FrameType | None) -> None:
+        got.append(number)
+        raise ending()
+
+    def dropped(error: sys.UnraisableHookArgs) -> None:
+        if got and error.exc_type in (KeyboardInterrupt, SystemExit):  # send it again, to somewhere else
+            threading.Timer(_AGAIN_S, os.kill, (os.getpid(), got[-1])).start()
+        else:
+            otherwise(error)
+
+    with contextlib.ExitStack() as handlers:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+                handlers.enter_context(_handled(number, end))
+        sys.unraisablehook = dropped
+        try:
+            yield
+        except BaseException as error:
+            if not got or isinstance(error, KeyboardInterrupt | SystemExit):
+                raise
+            raise ending() from error
+        finally:
+            sys.unraisablehook = otherwise
 
 
 class Interrupt:
@@ -120,6 +140,7 @@ class Interrupt:
 
     def __enter__(self) -> Interrupt:
         """Install the handler of Ctrl-C."""
+        self._before = signal.getsignal(signal.SIGINT) or signal.default_int_handler
         self._listening.__enter__()
         return self
 
@@ -153,7 +174,7 @@ class Interrupt:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self._presses += 1
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, self._before)
         say("finishing with the frames so far; Ctrl-C again stops at once")
 
 

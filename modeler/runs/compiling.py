@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -68,6 +69,7 @@ def compile_kernels(say: Callable[[str], None]) -> None:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
+            cwd=os.path.dirname(__file__),  # the current folder may hold settings of Numba
             env=environment(),
         )
         for job in missing
