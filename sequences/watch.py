@@ -135,10 +135,10 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
         faults = {}
         try:
             sequence = open_sequence(path, overrides)
-            indices = sequence.indices if settled else sequence.indices[:-1]
+            coming = [(index, sequence) for index in sequence.indices if index not in taken]
         except InputError as error:  # half-written, perhaps
-            faults[None], indices = error, ()
-        for index in (index for index in indices if index not in taken):
+            faults[None], coming = error, []
+        for index, sequence in coming if settled else coming[:-1]:
             try:
                 frame = sequence.frame(index)
             except InputError as error:
