@@ -17,7 +17,7 @@ from fake_builder import PATIENCE_S, book, sequence, started, wait_for
 
 from modeler.batch import engines, jobs
 from modeler.batch.jobs import NOTES, Job, fingerprint, standing
-from modeler.batch.models import TABLE, models_in
+from modeler.batch.models import TABLE, models_in, write_models
 from modeler.cli import parsed
 from modeler.cli.batch import Batch
 from modeler.cli.manifest import Row, named, read_manifest
@@ -61,6 +61,43 @@ def test_each_sequence_is_built_once_and_its_status_is_kept(cli: Run, tmp_path: 
     assert len(book(out)) == before
     assert rows(out) == told
     assert cli("batch", good, "--out", out).status == 0
+
+
+STATES = {
+    "deep": "[" * 100_000,
+    "none": "[]",
+    "large": '{"status": 1180591620717411303424}',
+    "negative": '{"status": 0, "tries": -1}',
+    "text": '{"status": "0"}',
+    "arguments": '{"arguments": [3]}',
+    "other": '{"something": {}}',
+    "record": '{"status": 0, "record": {"frames": 1180591620717411303424}}',
+    "frames": '{"status": 0, "record": {"frames": "three"}}',
+}
+
+
+@pytest.mark.parametrize("content", STATES)
+def test_a_state_that_nobody_wrote_is_none(tmp_path: Path, content: str) -> None:
+    (tmp_path / NOTES).mkdir()
+    (tmp_path / NOTES / "a.json").write_text(STATES[content])
+    write_models(tmp_path)
+    (row,) = rows(tmp_path).values()
+    assert {name: value for name, value in row.items() if value is not None} == {"name": "a", "tries": 0}
+    job = Job("a", str(tmp_path / "s"), str(tmp_path))
+    assert standing(job) == "new"
+
+
+def test_logs_and_states_lead_nowhere_and_hold_nobody_up(cli: Run, tmp_path: Path) -> None:
+    out, other = tmp_path / "out", tmp_path / "other"
+    sequences = [sequence(tmp_path / name) for name in ("linked", "piped")]
+    (out / NOTES).mkdir(parents=True)
+    other.write_text("kept")
+    for ending in ("log", "json"):
+        (out / NOTES / f"linked.{ending}").symlink_to(other)
+        os.mkfifo(out / NOTES / f"piped.{ending}")
+    ended = cli("batch", *sequences, "--out", out)
+    assert ended.status == 0, ended.err
+    assert other.read_text() == "kept"
 
 
 def test_what_fails_once_is_tried_again_and_goes_on_where_it_was(cli: Run, tmp_path: Path) -> None:

@@ -10,15 +10,16 @@ import glob
 import hashlib
 import json
 import os
+import stat
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 from modeler.system.processes import environment
 
@@ -32,6 +33,8 @@ ENDED = (0, 3)
 """Statuses of completed builds."""
 Standing = Literal["new", "interrupted", "done", "changed", "failed"]
 _CHUNK_BYTES = 1 << 20
+_NOTE_BYTES = 1 << 24  # of a note at most
+_MOST = 1 << 31  # of a number in it
 _LINE = "modeler: "
 
 
@@ -127,21 +130,56 @@ def fingerprint(job: Job, *, content: bool) -> str:
 
 def read_note(path: Path) -> dict[str, Any]:
     """Return the state of a sequence; empty without a valid file."""
+    from modeler.system.regular_files import read_json
+    from modeler.types import InputError
+
     try:
-        note = json.loads(path.read_text())
-    except (OSError, ValueError):
+        note = read_json(path, _NOTE_BYTES)
+    except InputError:
         return {}
-    return note if isinstance(note, dict) else {}
+    return note if isinstance(note, dict) and all(_valid(name, value) for name, value in note.items()) else {}
+
+
+def _valid(name: str, value: object) -> bool:
+    """Return whether an entry of a note is one that `write_note` may have written."""
+    match value:
+        case bool():
+            return False
+        case int():
+            return (name in ("status", "tries") and 0 <= value < _MOST) or name == "seconds"
+        case list():
+            return name == "arguments" and all(isinstance(word, str) for word in value)
+        case dict():
+            return name == "record"
+        case float():
+            return name == "seconds"
+        case _:
+            return isinstance(value, str) and name in ("sequence", "glance", "content", "line")
 
 
 def write_note(path: Path, note: dict[str, Any]) -> None:
     """Replace the state of a sequence atomically."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
+    part.unlink(missing_ok=True)
     try:
-        part.write_text(json.dumps(note) + "\n")
+        with open(part, "x") as file:
+            file.write(json.dumps(note) + "\n")
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Open the log of a sequence for appending; what is no regular file there, as a link, is replaced.
+
+    Raises:
+        OSError: if it cannot be opened.
+    """
+    with suppress(FileNotFoundError):
+        if not stat.S_ISREG(os.lstat(path).st_mode):
+            path.unlink()
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    return os.fdopen(os.open(path, flags, 0o666), "ab")
 
 
 def standing(job: Job, note: dict[str, Any] | None = None) -> Standing:
@@ -225,7 +263,7 @@ def run(job: Job) -> Ended | None:
         OSError: if no file can be written in the folder of the batch.
     """
     job.log.parent.mkdir(parents=True, exist_ok=True)
-    with open(job.log, "ab") as log:
+    with open_log(job.log) as log:
         fcntl.flock(log, fcntl.LOCK_EX)  # shared by the process that builds, also where this one dies before it
         now = standing(job)
         if now in ("done", "failed"):

@@ -9,7 +9,7 @@ from typing import Any
 
 from modeler.batch.jobs import NOTES, read_note
 from modeler.export import RunFolder, mesh_of, poses_of, read_model, write_atomically
-from modeler.export.models_table import finite, model_columns, report_columns, write_table
+from modeler.export.models_table import finite, fits, model_columns, report_columns, write_table
 from modeler.types import Array, InputError
 
 TABLE = "models.parquet"
@@ -69,6 +69,8 @@ def models_in(out: Path) -> list[dict[str, Any]]:
     for name in sorted(notes.keys() | runs):
         note = notes.get(name, {})
         record = note.get("record")
+        if record is not None and not fits(record):
+            record, note = None, {}
         if record is None and not note and name in runs:
             record, note = _of_build(out / name)
         row = {**(record or {}), "name": name, "status": note.get("status"), "tries": note.get("tries", 0)}

@@ -67,6 +67,17 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     write_atomically(path, content.getvalue())
 
 
+def fits(row: Mapping[str, Any]) -> bool:
+    """Return whether the values of a row are of the types of its columns."""
+    import pyarrow as pa
+
+    try:
+        pa.Table.from_pylist([dict(row)], schema=_schema())
+    except (pa.ArrowException, TypeError, ValueError, OverflowError):
+        return False
+    return True
+
+
 def read_table(path: Path) -> list[dict[str, Any]]:
     """Return the rows of a table.
 
