@@ -27,6 +27,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "fuzz": ("damaged inputs of every format: read, or refused in one line", "hours"),
     "fuzz.guided": ("the same for one format, led by coverage (needs atheris)", "as long as told"),
     "growing": ("draw a model that grows, with the uncertainty of its poses", "a minute"),
+    "hostile": ("commands in hostile environments: no traceback, no hang, nothing left behind", "two hours"),
     "in_hand": ("whole models of objects in a hand", "half an hour"),
     "kills": ("commands that are killed and given again end with the same bytes", "16 minutes"),
     "live": ("following an object before a camera of 30 Hz in real time", "minutes"),

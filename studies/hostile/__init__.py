@@ -1,0 +1,1 @@
+"""Commands in hostile environments: settings, caches, folders, limits, sockets and signals."""

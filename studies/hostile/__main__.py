@@ -1,0 +1,256 @@
+"""Run commands in hostile environments, and tell where one ends in a traceback, hangs, or leaves a process behind.
+
+    python -m studies hostile --count 500 --seed 0
+
+Each trial is one command under one to three faults: settings of libraries, damaged caches of kernels, what lies in the
+current folder, limits, closed streams, a viewer that stays silent, a signal at any moment. A command must end with
+0, 2 or 3, or by the signal; what it says of a fault is one line. What fails is listed, and the status is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from modeler.kernels import cache
+from modeler.runs.compiling import compile_kernels
+from modeler.sequences import bundled
+
+_BOX: Final = str(bundled("box"))
+_FEW: Final = ("--prior", "table", "--method", "icp", "--frames", ":3")
+COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "info": ("info", _BOX),
+    "register": ("register", _BOX, "0", "1", "--prior", "table", "--method", "icp"),
+    "build": ("build", _BOX, "--out", "{out}/run", *_FEW),
+    "batch": ("batch", _BOX, "--out", "{out}/runs", "--workers", "1", *_FEW),
+    "convert": ("convert", _BOX, "--out", "{out}/scene"),
+    "report": ("report", "{run}", "--out", "{out}/report.html"),
+    "export": ("export", "{run}", "--out", "{out}/model.obj"),
+    "suggest": ("suggest", "{run}"),
+}
+"""Arguments; `{out}` is an empty folder, `{run}` a finished run."""
+_MODULES: Final = ("numpy", "json", "rerun", "numba", "pyarrow", "modeler", "sitecustomize", "encodings")
+_SETTINGS: Final = {
+    "NUMBA_OPT": ("0", "nonsense"),
+    "NUMBA_CPU_NAME": ("generic", "nonsense"),
+    "NUMBA_THREADING_LAYER": ("tbb", "workqueue", "nonsense"),
+    "NUMBA_NUM_THREADS": ("1", "0", "-1", "9" * 40),
+    "NUMBA_DISABLE_JIT": ("1",),
+    "NUMBA_BOUNDSCHECK": ("1",),
+    "NUMBA_DEBUG": ("1",),
+    "RERUN": ("off", "nonsense"),
+    "RERUN_FLUSH_NUM_BYTES": ("nonsense", "0"),
+    "RERUN_STRICT": ("1",),
+    "HOME": ("/dev/null", "", "/nowhere"),
+    "XDG_CACHE_HOME": ("/dev/null", "relative"),
+    "TMPDIR": ("/nowhere",),
+    "LC_ALL": ("C", "nonsense"),
+    "TERM": ("dumb", ""),
+    "COLUMNS": ("1", "0", "nonsense"),
+    "PYTHONOPTIMIZE": ("2",),
+    "OMP_NUM_THREADS": ("nonsense", "0"),
+}
+_LIMITS: Final = ("-n 8", "-n 40", "-n 300", "-f 100", "-f 2000", "-v 400000", "-v 3000000", "-s 256")
+_ENDED: Final = (0, 2, 3)
+_LIMIT_S: Final = 150.0  # with kernels to compile, and other work on the machine
+_LEAVES_S: Final = 20.0  # after a signal
+
+
+@dataclass
+class Trial:
+    """One command and its faults."""
+
+    folder: Path
+    """Its own, with `out`, `here` and `cache` in it."""
+    environment: dict[str, str]
+    """Of the command."""
+    shell: str = 'exec "$@"'
+    """Starts the command."""
+    signalled: tuple[int, float] | None = None
+    """Number and moment in s of a signal."""
+    options: tuple[str, ...] = ()
+    """Further ones of a build."""
+    said: list[str] = field(default_factory=list)
+    """Its faults in words."""
+
+    @property
+    def here(self) -> Path:
+        """The current folder of the command."""
+        return self.folder / "here"
+
+
+def settings(trial: Trial, rng: np.random.Generator) -> None:
+    """Change a setting of a library."""
+    name = rng.choice(list(_SETTINGS))
+    trial.environment[name] = rng.choice(_SETTINGS[name])
+    trial.said.append(f"{name}={trial.environment[name][:20]}")
+
+
+def damaged_cache(trial: Trial, rng: np.random.Generator) -> None:
+    """Damage kernels, or let none be kept."""
+    files = [path for path in (trial.folder / "cache").rglob("*") if path.is_file()]
+    how = str(rng.choice(["empty", "cut", "flip", "fifo", "folder", "link", "none"]))
+    trial.said.append(f"kernels: {how}")
+    for path in [files[k] for k in rng.choice(len(files), 2)] if how != "none" else ():
+        data = bytearray(path.read_bytes()) if path.is_file() else bytearray(1)
+        path.unlink(missing_ok=True)
+        match how:
+            case "empty":
+                path.touch()
+            case "cut":
+                path.write_bytes(data[: len(data) // 2])
+            case "flip":
+                data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+                path.write_bytes(data)
+            case "fifo":
+                os.mkfifo(path)
+            case "folder":
+                path.mkdir()
+            case _:
+                path.symlink_to("/dev/zero")
+    if how == "none":
+        trial.environment |= {"NUMBA_CACHE_DIR": "/dev/null/kernels", "HOME": "/dev/null"}
+
+
+def hostile_folder(trial: Trial, rng: np.random.Generator) -> None:
+    """Put files into the current folder that libraries look for."""
+    for name in _MODULES:
+        (trial.here / f"{name}.py").write_text(f"open({str(trial.folder / 'ran')!r}, 'w').close()")
+    (trial.here / ".numba_config.yaml").write_text(str(rng.choice(["opt: nonsense", "disable_jit: 1", "{[", "3"])))
+    trial.said.append("files in the current folder")
+
+
+def limits(trial: Trial, rng: np.random.Generator) -> None:
+    """Limit what the command may use."""
+    limit = str(
+        rng.choice(["-n 8", "-n 40", "-n 300", "-f 100", "-f 2000", "-v 400000", "-v 3000000", "-u 20", "-s 256"])
+    )
+    trial.shell = f"ulimit {limit}; {trial.shell}"
+    trial.said.append(f"ulimit {limit}")
+
+
+def streams(trial: Trial, rng: np.random.Generator) -> None:
+    """Close or fill the standard streams."""
+    how = str(rng.choice([">&-", "2>&-", "<&-", "> /dev/full", "2> /dev/full", "< /dev/zero"]))
+    trial.shell = f"{trial.shell} {how}"
+    trial.said.append(how)
+
+
+def sent(trial: Trial, rng: np.random.Generator) -> None:
+    """Send a signal."""
+    number = int(rng.choice([signal.SIGINT, signal.SIGTERM, signal.SIGHUP]))
+    trial.signalled = number, float(rng.uniform(0.0, 15.0))
+    trial.said.append(f"signal {number} after {trial.signalled[1]:.1f} s")
+
+
+FAULTS: Final[tuple[Callable[[Trial, np.random.Generator], None], ...]] = (
+    settings,
+    damaged_cache,
+    hostile_folder,
+    limits,
+    streams,
+    sent,
+)
+
+
+def outcome(trial: Trial, command: tuple[str, ...]) -> str:
+    """Run the command of a trial, and return what is wrong with how it ends: nothing is ""."""
+    began_s = time.monotonic()
+    with open(trial.folder / "said", "w+b") as said:
+        process = subprocess.Popen(
+            ["bash", "-c", trial.shell, "-", sys.executable, "-P", "-m", "modeler", *command, *trial.options],
+            cwd=trial.here,
+            env=trial.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            start_new_session=True,
+        )
+        fault, allowed = "", set(_ENDED)
+        try:
+            if trial.signalled is not None:
+                number, after_s = trial.signalled
+                allowed |= {128 + number, -number, 1}
+                try:
+                    process.wait(after_s)
+                except subprocess.TimeoutExpired:
+                    process.send_signal(number)
+            process.wait(_LIMIT_S if trial.signalled is None else _LEAVES_S)
+        except subprocess.TimeoutExpired:
+            fault = f"does not end in {time.monotonic() - began_s:.0f} s"
+        time.sleep(0.2)
+        try:
+            os.killpg(process.pid, signal.SIGKILL)
+            fault = fault or "leaves a process behind"
+        except ProcessLookupError:
+            pass
+        process.wait()
+        said.seek(0)
+        words = said.read().decode(errors="replace")
+    if ">&-" in trial.shell or "/dev/full" in trial.shell:
+        allowed.add(1)
+    if fault:
+        return fault
+    if "Traceback" in words or "panicked" in words or process.returncode not in allowed:
+        return f"ends with status {process.returncode}: {words[-400:]}"
+    return "runs a file of the current folder" if (trial.folder / "ran").exists() else ""
+
+
+def main() -> int:
+    """Run the trials and return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies hostile", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--count", type=int, default=500, help="how many trials")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no trial after so long")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("runs/hostile"), help="folder of the trials, which is emptied")
+    options = parser.parse_args()
+    out = options.out.absolute()
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    compile_kernels()
+    root = str(Path(cache.__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": root}
+    built = [sys.executable, "-m", "modeler", "build", _BOX, "--out", str(out / "run"), *_FEW]
+    assert subprocess.run(built, env=environment, check=False, stderr=subprocess.DEVNULL).returncode in _ENDED
+    began_s, failed, count = time.monotonic(), 0, 0
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"rerun+http://127.0.0.1:{silent.getsockname()[1]}/proxy"
+        for count in range(1, options.count + 1):
+            if time.monotonic() - began_s > options.seconds:
+                break
+            rng = np.random.default_rng([options.seed, count])
+            name, folder = str(rng.choice(list(COMMANDS))), out / f"{count:04d}"
+            trial = Trial(folder, {**environment, "NUMBA_CACHE_DIR": str(folder / "cache")})
+            for part in ("out", "here"):
+                (folder / part).mkdir(parents=True)
+            shutil.copytree(cache.folder(), folder / "cache" / cache.folder().name)
+            for k in rng.choice(len(FAULTS), rng.integers(1, 4), replace=False):
+                FAULTS[k](trial, rng)
+            if name == "build" and rng.random() < 0.3:
+                trial.options = ("--connect", address)
+                trial.said.append("a silent viewer")
+            command = tuple(word.format(out=folder / "out", run=out / "run") for word in COMMANDS[name])
+            fault = outcome(trial, command)
+            failed += bool(fault)
+            print(f"{count:4d} {name:9} {'; '.join(trial.said):60} {fault or 'ended well'}", flush=True)
+            shutil.rmtree(folder)
+    print(f"{failed} of {count} trials failed in {time.monotonic() - began_s:.0f} s")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
