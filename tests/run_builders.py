@@ -59,7 +59,7 @@ def made_up_steps(count: int = 4, *, closure: bool = True) -> list[Step]:
         index, last = 3 + 2 * number, number == count - 1
         frame = Frame(index, 0.1 * index, np.full((3, 4), 0.8, dtype=np.float32), camera)
         pixels = np.zeros((5, 2), dtype=np.int64)
-        view = RayImage(frame, None, 0.001, 0.001, np.ones((5, 3)), np.ones((5, 3)), pixels)
+        view = RayImage(frame, None, 0.001, 0.0025, np.ones((5, 3)), np.ones((5, 3)), pixels)
         edges = [an_edge(index - 2, index, rng)] if number else []
         if last and closure:
             edges.append(an_edge(3, index, rng, "closure"))

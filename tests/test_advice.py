@@ -59,10 +59,14 @@ def untrusted(
             priors.GeneralPrior(),
             {"max_rotation_deg": "100"},
         ),
-        (untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT), priors.TablePrior(), {"max_shift_m": "0.1"}),
         (
             untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT),
-            priors.GeneralPrior(),
+            priors.TablePrior(max_shift_m=0.05),
+            {"max_shift_m": "0.1"},
+        ),
+        (
+            untrusted("left_out", turn_deg=10.0, outcome=Outcome.AT_LIMIT),
+            priors.GeneralPrior(max_offset_m=0.04),
             {"max_offset_m": "0.08"},
         ),
         (untrusted("left_out", outcome=Outcome.NO_OVERLAP), priors.GeneralPrior(), None),

@@ -182,7 +182,7 @@ def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None
     alone, shifted = solve(graph, {}), solve(graph, {}, common_shift_m2=shift)
     seen = RayImage(Frame(0, 0.0, np.zeros((1, 1), np.float32), CAMERA), None, 0.0, 0.0, OBJECT_M[None], OBJECT_M[None],
                     np.zeros((1, 2), np.int64))  # fmt: skip
-    spreads = [spread_of_positions(dict.fromkeys(TRUTH, seen), solution) for solution in (alone, shifted)]
+    spreads = [spread_of_positions(dict.fromkeys(TRUTH, seen), solution, 0.005) for solution in (alone, shifted)]
     assert spreads[0] is not None
     assert spreads[1] is not None
     assert spreads[1].check.value == pytest.approx(spreads[0].check.value, rel=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -82,7 +83,8 @@ class Build:
         check_run_folder(self.out, inputs, overwrite=self.overwrite, resume=self.resume)
         whole, frames, digests = _opened(self)
         modeler = compose.modeler(whole, self.prior, self.method, self.where)
-        modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.model.voxel_m))
+        tolerance_m = None if self.model.tolerance_mm is None else 1e-3 * self.model.tolerance_mm
+        modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.model.voxel_m), tolerance_m=tolerance_m)
         prior, remark = compose.resolved_prior(self.prior, whole)
         meta = RunMeta(
             sequence=str(self.sequence),
@@ -115,7 +117,7 @@ class Build:
     def settings(self) -> dict[str, object]:
         """Return the settings besides sequence, seed and the prior's name, as recorded in report.json."""
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
-        parts["voxel_m"] = self.model.voxel_m
+        parts |= {name: getattr(self.model, name) for name in ("voxel_m", "tolerance_mm")}
         files = {"sensor": self.model.sensor, "camera": self.model.camera}
         parts |= {name: None if path is None else str(path.absolute()) for name, path in files.items()}
         parts |= self.given.settings()
@@ -160,6 +162,9 @@ def _check(options: Build) -> None:
     voxel_m = options.model.voxel_m
     if voxel_m is not None and not MIN_VOXEL_M <= voxel_m < 1.0:
         raise InputError(f"--voxel-m {voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
+    tolerance_mm = options.model.tolerance_mm
+    if tolerance_mm is not None and not 0.0 < tolerance_mm < math.inf:
+        raise InputError(f"--tolerance-mm {tolerance_mm:g} is out of range; give a positive length in mm")
     if options.connect is not None:
         reachable(options.connect)  # rejects invalid addresses; the connection is made with the first data
 
@@ -308,6 +313,8 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
         )
     if (camera := report.get("camera")) and (words := estimated_focal_length(camera)):
         say(words)
+    if trusted_to_m := report.get("trusted_to_m"):
+        say(f"the model can be trusted to {1000.0 * trusted_to_m:.1f} mm")
     if report["reasons"]:
         coded = list(zip(report.get("reason_codes") or report["reasons"], report["reasons"], strict=False))
         # Frames left out were reported above.

@@ -48,6 +48,10 @@ class ModelOptions:
     """Focal length of the depth camera, as `modeler calibrate-camera` estimated it."""
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from the data")] = None
     """Side of a voxel of the model."""
+    tolerance_mm: Annotated[
+        float | None, tyro.conf.arg(metavar="MM"), default("7.5 % of the object's size, at least twice the noise")
+    ] = None
+    """Error of the surface up to which the model serves its purpose; exit status 0 promises to keep it."""
 
 
 @dataclass(frozen=True)

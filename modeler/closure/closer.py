@@ -43,7 +43,7 @@ class Closer:
     """Largest predicted rotation in degrees to an earlier view."""
     max_return_deg: float = LARGE_DEG
     """The same between the last frame and the first if no loop is closed yet: the largest rotation across which views
-    are registered (`priors.general.relaxed_limits`). A turn of few large steps ends one step before its start."""
+    are registered (`priors.general.relaxed_rotation_deg`). A turn of few large steps ends one step before its start."""
     away_deg: float = AWAY_DEG
     """Rotation in degrees by which the object must have turned away from an earlier view for an edge to it to be a
     closure."""

@@ -141,8 +141,8 @@ class ConsistencyModel:
     """Factor on the standard deviations of edges, which may be optimistic."""
     drift_deg: float = 0.15
     """Systematic rotation error of an edge in degrees; it accumulates along a chain."""
-    drift_m: float = 0.00025
-    """Systematic translation error of an edge in m, at the object; it accumulates along a chain."""
+    drift: float = 0.0004
+    """Systematic translation error of an edge as a share of the object's distance; it accumulates along a chain."""
     max_distance: float = 4.7390
     """Largest Mahalanobis distance: √χ²₆(0.999), which 1 of 1000 true closures exceeds."""
     min_weight: float = 0.05
@@ -155,7 +155,8 @@ class ConsistencyModel:
             length: number of edges.
             centroid_m: (3,) of the object in that camera.
         """
-        sigmas = length * np.repeat([np.radians(self.drift_deg), self.drift_m], 3)  # method, eq. 9.3
+        drift_m = self.drift * float(np.linalg.norm(centroid_m))
+        sigmas = length * np.repeat([np.radians(self.drift_deg), drift_m], 3)  # method, eq. 9.3
         return se3.covariance_about(np.diag(sigmas**2), -centroid_m)
 
     def consistency(

@@ -64,9 +64,9 @@ class PriorOptions:
     """Fields of your own prior, values in Python syntax: step_deg=25 axis=(0,0,1) (module:Class)."""
     max_rotation_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("50")] = None
     """Largest rotation between two frames (general, table)."""
-    max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.04")] = None
+    max_offset_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.75 of the object's size")] = None
     """Largest distance between the centroids of the object in two frames (general, held)."""
-    max_shift_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.05")] = None
+    max_shift_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("0.75 of the object's size")] = None
     """Largest shift of the object on the table, or across the axis (table, turntable)."""
     step_deg: Annotated[float | None, tyro.conf.arg(metavar="DEG"), default("from sequence.json")] = None
     """Turn from one frame number to the next, right-handed about the axis, which points up (turntable)."""

@@ -264,6 +264,8 @@ _WHOLE: dict[str, Test] = {
     "loop": _null_or(_is_loop),
     "camera": _null_or(_is_camera),
     "trustworthy": _is(bool),
+    "tolerance_m": _null_or(_is_number),
+    "trusted_to_m": _null_or(_is_number),
     "reasons": lambda value: isinstance(value, list) and all(map(_is_text, value)),
     "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),
     "evidence": _null_or(lambda value: isinstance(value, dict) and all(map(_is_figure, value.values()))),
@@ -310,4 +312,5 @@ _SETTINGS: dict[str, Test] = {
     "roi": _null_or(lambda value: isinstance(value, list) and len(value) == 4 and all(map(_is_whole, value))),
     "max_depth_m": _null_or(_is_number),
     "voxel_m": _null_or(_is_number),
+    "tolerance_mm": _null_or(_is_number),
 }

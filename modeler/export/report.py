@@ -93,6 +93,8 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         "loop": _loop(step.edges_so_far, solution, views),
         "camera": _camera(meta.camera, solution, views),
         "trustworthy": verdict.trustworthy,
+        "tolerance_m": verdict.tolerance_m,
+        "trusted_to_m": verdict.trusted_to_m,
         "reasons": verdict.reasons,
         "reason_codes": verdict.codes,
         "evidence": {

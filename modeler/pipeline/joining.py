@@ -37,7 +37,8 @@ from modeler.types import (
     Solution,
 )
 
-_ALIGNMENT_SIGMA_RAD, _ALIGNMENT_SIGMA_M = 0.12, 0.01  # standard deviations of the models' alignment
+_ALIGNMENT_SIGMA_RAD = 0.12  # standard deviation of the models' alignment
+_ALIGNMENT_SIGMA = 0.15  # of its shift, in units of the object's size
 _OPEN_SHARE = 0.5  # of the first: with more, the images add less than three times the information of the alignment
 _MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment; beyond, it is at another mode
 _MAX_VIEWS: Final = 20  # of a segment, compared with as many of the other
@@ -209,7 +210,7 @@ class Joiner:
                 np.ones(1),
                 centre_m=views[0].centroid_m,
                 sigma_rad=_ALIGNMENT_SIGMA_RAD,
-                sigma_m=_ALIGNMENT_SIGMA_M,
+                sigma_m=_ALIGNMENT_SIGMA * views[0].size_m,
                 evidence=False,
             )
             posterior = self.registrations.register(*views, density).without_samples()

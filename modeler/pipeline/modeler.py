@@ -79,6 +79,9 @@ class Modeler:
     common_distance: float = 0.001
     """Standard deviation of a bias of all distances, as a share of them, unless the focal length is exact. Loops do not
     observe it, and a larger value does not improve the calibration for cameras other than the renderer's."""
+    tolerance_m: float | None = None
+    """Error of the surface above which a model is called wrong; None: a share of the object's size, at least what the
+    camera's noise allows."""
     seed: int = 0
     """Each pair has its own random generator, seeded with this and the two frame numbers."""
     cache: AbstractPairCache | None = None
@@ -322,6 +325,7 @@ class Run:
             closure_expected=self.closure_expected,
             prior=self.modeler.prior,
             depth_scale_sigma=self.depth_scale_sigma,
+            tolerance_m=self.modeler.tolerance_m,
         )
         yield replace(last, verdict=verdict)
 

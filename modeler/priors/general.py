@@ -13,6 +13,8 @@ from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
 
 _SMALL_DEG = 30.0  # turn up to which the limit of the centroids' offset is used as given
 LARGE_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of its surface seen before
+_OFFSET_SHARE = 0.75  # of the object's size: 4 to 6 cm for boxes, bottles and caps of 15 to 20 cm on a turntable
+_LEAST_SIZE_M = 1e-3  # of an object: that of a single point is 0
 _MARGIN_DEG = 5.0  # of limits around confident proposals: they bound the search, and must not truncate the posterior
 
 
@@ -22,10 +24,12 @@ class GeneralPrior(AbstractPrior):
 
     max_rotation_deg: float = 50.0
     """Largest rotation between the two views."""
-    max_offset_m: float = 0.04
-    """Largest distance between the target's centroid and the source's, transformed."""
+    max_offset_m: float | None = None
+    """Largest distance between the target's centroid and the source's, transformed; None: 0.75 of the object's size."""
     limits_assumed: bool = False
     """Whether the limits are defaults: if nothing within them matches, any motion is possible."""
+    steps: float = 1.0
+    """Number of steps of a motion, at least 1: offsets add up."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -33,14 +37,13 @@ class GeneralPrior(AbstractPrior):
 
     def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
         """Return the density of target_from_source."""
-        return GeneralDensity(
-            source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), self.max_offset_m
-        )
+        offset_m = offset_limit_m(self.max_offset_m, self.steps, source, target)
+        return GeneralDensity(source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), offset_m)
 
     def relaxed(self, steps: float) -> GeneralPrior:
         """Return the prior with limits for several steps."""
-        rotation_deg, offset_m = relaxed_limits(self.max_rotation_deg, self.max_offset_m, steps)
-        return replace(self, max_rotation_deg=rotation_deg, max_offset_m=offset_m)
+        rotation_deg = relaxed_rotation_deg(self.max_rotation_deg, steps)
+        return replace(self, max_rotation_deg=rotation_deg, steps=steps * self.steps)
 
     def unlimited(self) -> AnyMotion | None:
         """Return the prior of any motion if the limits are defaults, else None."""
@@ -67,7 +70,7 @@ class AnyMotion(AbstractPrior):
 
     def reach_m(self, source: RayImage, target: RayImage) -> float:
         """Return the largest distance of the centroids."""
-        return min(self.max_offset * max(source.size_m, target.size_m, 1e-3), MAX_LENGTH_M)
+        return min(self.max_offset * max(source.size_m, target.size_m, _LEAST_SIZE_M), MAX_LENGTH_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,17 +111,25 @@ class GeneralDensity(AbstractPoseDensity):
         return np.where(inside, -np.log(rotations * offsets), -np.inf)
 
 
-def relaxed_limits(max_rotation_deg: float, max_offset_m: float, steps: float) -> tuple[float, float]:
-    """Return the limits of rotation in degrees and of the centroids' offset in m for a number of steps (at least 1).
+def relaxed_rotation_deg(max_rotation_deg: float, steps: float) -> float:
+    """Return the limit of the rotation in degrees for a number of steps (at least 1).
 
-    The rotation is capped, as views farther apart share too little surface to be registered.
+    It is capped, as views farther apart share too little surface to be registered.
     """
-    rotation_deg = max(max_rotation_deg, min(steps * max_rotation_deg, LARGE_DEG))
-    return rotation_deg, relaxed_offset_m(max_offset_m, steps)
+    return max(max_rotation_deg, min(steps * max_rotation_deg, LARGE_DEG))
 
 
-def relaxed_offset_m(max_offset_m: float, steps: float) -> float:
-    """Return the limit of the centroids' offset in m for a number of steps (at least 1): offsets add up."""
+def offset_limit_m(max_offset_m: float | None, steps: float, source: RayImage, target: RayImage) -> float:
+    """Return the limit of the centroids' offset in m.
+
+    Args:
+        max_offset_m: the limit of one step; None: a share of the object's size.
+        steps: number of steps, at least 1.
+        source: one view.
+        target: another.
+    """
+    if max_offset_m is None:
+        max_offset_m = _OFFSET_SHARE * max(source.size_m, target.size_m, _LEAST_SIZE_M)
     return min(steps * max_offset_m, MAX_LENGTH_M)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.checks import ParameterError, check_parameters
-from modeler.priors.general import GeneralPrior, reach_deg, relaxed_offset_m, turned_offset_m
+from modeler.priors.general import GeneralPrior, offset_limit_m, reach_deg, turned_offset_m
 from modeler.priors.mixtures import Alternatives, KernelMixture, defensive_mixture
 from modeler.types import AbstractPoseDensity, AbstractPrior, Edge, HandPoses, RayImage, Solution
 
@@ -39,9 +39,9 @@ class HeldPrior(AbstractPrior):
     """Prior of the object's motion in a regrasp; evidence."""
     steps: float = 1.0
     """Number of steps of a motion."""
-    max_offset_m: float = GeneralPrior.max_offset_m
+    max_offset_m: float | None = None
     """Largest distance between the centroids if the hand is only a proposal (returns to earlier views); it grows with
-    turns beyond 30 degrees."""
+    turns beyond 30 degrees. None: 0.75 of the object's size."""
     previous: int | None = None
     """The frame relative to which a new one is placed: motions from it are evidence, others are not; None: all are."""
 
@@ -74,7 +74,8 @@ class HeldPrior(AbstractPrior):
             return defensive_mixture(known, [regrasped], _REGRASPED_SHARE)
         # The hand's motion to an earlier view is already part of the edges in between; here it is only a proposal,
         # within limits about it or, after a regrasp, about zero motion; weights by volume make the density uniform.
-        offset_m = turned_offset_m(self.max_offset_m, float(se3.rotation_angle(motion)))
+        offset_m = offset_limit_m(self.max_offset_m, self.steps, source, target)
+        offset_m = turned_offset_m(offset_m, float(se3.rotation_angle(motion)))
         limits = GeneralPrior(reach_deg(float(np.degrees(sigma_rad))), offset_m).between(source, target)
         within = (replace(limits, middle=motion[:3, :3]), self.regrasped.between(source, target))
         volumes = np.exp([-float(part.log_density(part.sample(1, np.random.default_rng(0)))[0]) for part in within])
@@ -82,8 +83,7 @@ class HeldPrior(AbstractPrior):
 
     def relaxed(self, steps: float) -> HeldPrior:
         """Return the prior with limits for several steps; their motion is the hand's unless it regrasps."""
-        offset_m = relaxed_offset_m(self.max_offset_m, steps)
-        return replace(self, max_offset_m=offset_m, regrasped=self.regrasped.relaxed(steps), steps=steps * self.steps)
+        return replace(self, regrasped=self.regrasped.relaxed(steps), steps=steps * self.steps)
 
     def unlimited(self) -> HeldPrior | None:
         """Return the prior without limits on the motion in a regrasp, if these are defaults, else None."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.checks import check_parameters
-from modeler.priors.general import AnyMotion, GeneralPrior, centroid_offset, relaxed_limits
+from modeler.priors.general import AnyMotion, GeneralPrior, centroid_offset, offset_limit_m, relaxed_rotation_deg
 from modeler.priors.mixtures import across_axis
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage
 
@@ -132,14 +132,17 @@ class TablePrior(AbstractPrior):
 
     max_rotation_deg: float = GeneralPrior.max_rotation_deg
     """Largest rotation about the plane's normal between the two views."""
-    max_shift_m: float = 0.05
-    """Largest distance, in the plane, between the target's centroid and the source's, transformed."""
+    max_shift_m: float | None = None
+    """Largest distance, in the plane, between the target's centroid and the source's, transformed; None: 0.75 of the
+    object's size."""
     sigma_tilt_deg: float = WOBBLE_DEG
     """Standard deviation of the rotation out of the plane, on top of the plane's own uncertainty."""
     sigma_height_m: float = WOBBLE_M
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
     limits_assumed: bool = False
     """Whether the limits are defaults: if nothing within them matches, any motion on the table is possible."""
+    steps: float = 1.0
+    """Number of steps of a motion, at least 1: shifts add up."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -152,15 +155,16 @@ class TablePrior(AbstractPrior):
             InputError: if neither view shows a support plane.
         """
         limit_rad = float(np.radians(self.max_rotation_deg))
+        shift_m = offset_limit_m(self.max_shift_m, self.steps, source, target)
         plane = on_plane(
             source,
             target,
             turn_rad=limit_rad,
-            shift_m=self.max_shift_m,
+            shift_m=shift_m,
             sigma_tilt_rad=np.radians(self.sigma_tilt_deg),
             sigma_lift_m=self.sigma_height_m,
         )
-        return TableDensity(plane, limit_rad, self.max_shift_m)
+        return TableDensity(plane, limit_rad, shift_m)
 
     def unlimited(self) -> AnyTurn | None:
         """Return the prior of any turn and shift on the table if the limits are defaults, else None."""
@@ -168,8 +172,8 @@ class TablePrior(AbstractPrior):
 
     def relaxed(self, steps: float) -> TablePrior:
         """Return the prior with limits for several steps; the constraint to the plane is unchanged."""
-        rotation_deg, shift_m = relaxed_limits(self.max_rotation_deg, self.max_shift_m, steps)
-        return replace(self, max_rotation_deg=rotation_deg, max_shift_m=shift_m)
+        rotation_deg = relaxed_rotation_deg(self.max_rotation_deg, steps)
+        return replace(self, max_rotation_deg=rotation_deg, steps=steps * self.steps)
 
 
 @dataclass(frozen=True)

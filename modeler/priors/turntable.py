@@ -12,7 +12,7 @@ import numpy as np
 from modeler import se3
 from modeler.priors.checks import check_parameters
 from modeler.priors.common_axis import Axis, common_axis, turn_sense
-from modeler.priors.general import GeneralPrior, centroid_offset, reach_deg, relaxed_offset_m, turned_offset_m
+from modeler.priors.general import GeneralPrior, centroid_offset, offset_limit_m, reach_deg, turned_offset_m
 from modeler.priors.mixtures import NODES, defensive_mixture, directions_about
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, TablePrior, no_plane, sample_disc, support
 from modeler.types import (
@@ -269,13 +269,15 @@ class TurntablePrior(AbstractPrior):
     about the camera's up (-y). 180 or more: any direction."""
     axis_sigma_m: float = 0.005
     """Standard deviation of the axis' point, orthogonal to the axis, if one is given."""
-    max_shift_m: float = TablePrior.max_shift_m
+    max_shift_m: float | None = None
     """Largest distance, orthogonal to the axis, between the target's centroid and the source's, transformed; it grows
-    with turns beyond 30 degrees."""
+    with turns beyond 30 degrees. None: 0.75 of the object's size."""
     wobble_deg: float = WOBBLE_DEG
     """Standard deviation of the rotation out of the axis."""
     wobble_m: float = WOBBLE_M
     """Standard deviation of the shift that is not due to the turn about the axis."""
+    steps: float = 1.0
+    """Number of steps of a motion, at least 1: shifts add up."""
     needs_table: bool = False
     """Whether views without a table are rejected: the product of table and step."""
     learned_axis: Axis | None = None
@@ -312,7 +314,7 @@ class TurntablePrior(AbstractPrior):
 
     def relaxed(self, steps: float) -> TurntablePrior:
         """Return the prior with limits for several steps; their turn follows from the frame numbers."""
-        return replace(self, max_shift_m=relaxed_offset_m(self.max_shift_m, steps))
+        return replace(self, steps=steps * self.steps)
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> TurntablePrior:
         """Return the prior with the common axis and sense of rotation of the pairs so far."""
@@ -374,13 +376,14 @@ class TurntablePrior(AbstractPrior):
             axis=axis,
             source_centroid_m=source.centroid_m,
             target_centroid_m=target.centroid_m,
-            max_shift_m=self._shift_m(steps),
+            max_shift_m=self._shift_m(source, target),
             wobble_m=max(self.wobble_m, _FLOOR),
         )
 
-    def _shift_m(self, steps: int) -> float:
-        """Return the largest shift for a number of steps: the centroid of the visible surface turns about the axis."""
-        return turned_offset_m(self.max_shift_m, float(np.radians(steps * self.step_deg)))
+    def _shift_m(self, source: RayImage, target: RayImage) -> float:
+        """Return the largest shift between two views: the centroid of the visible surface turns about the axis."""
+        shift_m = offset_limit_m(self.max_shift_m, self.steps, source, target)
+        return turned_offset_m(shift_m, float(np.radians((target.index - source.index) * self.step_deg)))
 
     def _limits(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the uniform density within reach of the steps, on the table if one is seen."""
@@ -389,8 +392,8 @@ class TurntablePrior(AbstractPrior):
         half_width_deg = reach_deg(float(self.step_sigma_deg * np.sqrt(abs(steps))))
         limit_deg = min(abs(turn_deg) + half_width_deg, 180.0)
         if support(source, target) is None:
-            return GeneralPrior(limit_deg, self._shift_m(steps)).between(source, target)
-        density = TablePrior(limit_deg, self._shift_m(steps)).between(source, target)
+            return GeneralPrior(limit_deg, self._shift_m(source, target)).between(source, target)
+        density = TablePrior(limit_deg, self._shift_m(source, target)).between(source, target)
         if self.step_sign == "unknown" or half_width_deg >= 180.0:
             return density
         return replace(

@@ -28,10 +28,10 @@ from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, Plane
 
 Window = tuple[slice, slice]
 _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
-_ZONE_MARGIN_M = 0.1  # distance from the object's zone at which it may still be
+_ZONE_MARGIN = 0.14  # distance from the object's zone at which it may still be, as a share of its distance
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
-_MOVED_M = 0.02  # of an object's outline between the frames from which its scene is learned
-_CREASE_M = 0.01  # creases of the support are at most so high, and so far from the object
+_MOVED = 0.028  # of an object's outline between the frames from which its scene is learned, as a share of its distance
+_CREASE = 0.014  # creases of the support are at most so high, and so far from the object, as a share of its distance
 _LOW_SHARE = 0.3  # share of the object's height, for flat objects
 _CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
 AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
@@ -58,7 +58,7 @@ def find(
     scene: Scene,
     noise: DepthNoise,
     *,
-    gap_m: float,
+    gap: float,
     occluder: BoolArray | None = None,
 ) -> Found:
     """Find the object in a depth image, NaN where nothing was measured or no object may be.
@@ -68,6 +68,7 @@ def find(
     """
     if scene.zone_m is None:
         return Found(np.zeros(depth_m.shape, dtype=np.bool_))
+    gap_m = gap * _distance_m(scene.zone_m)
     chosen = _choose(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
     mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(scene.zone_m), gap_m=gap_m)
     return replace(chosen, mask=mask)
@@ -321,7 +322,7 @@ def _refine(
     if not fore.any():
         return mask
     if above_m is not None:
-        fore &= _not_a_crease(above_m, fore, _CREASE_M * camera.fx / float(np.median(depth[fore])))
+        fore &= _not_a_crease(above_m, fore, _CREASE * float(np.median(depth[fore])), camera.fx * _CREASE)
     pixel = depth / np.float32(camera.fx)
     fore &= ~mixed_pixels(depth, tolerance_m=noise.tolerance_m(depth), pixel_m=pixel)
     mask[window] = without_specks(fore)
@@ -339,7 +340,7 @@ def _inside(points: Float32Array, low: Array, high: Array) -> BoolArray:
 def _reach_m(zone_m: Array) -> Array:
     """Return the zone (2, 3), low and high corner, extended by how far the object may have left it."""
     low, high = zone_m
-    margin = max(_ZONE_MARGIN_M, _ZONE_MARGIN_SHARE * float((high - low).max()))
+    margin = max(_ZONE_MARGIN * _distance_m(zone_m), _ZONE_MARGIN_SHARE * float((high - low).max()))
     return np.array([low - margin, high + margin])
 
 
@@ -369,9 +370,14 @@ def _foreground(
     return fore, height
 
 
-def _not_a_crease(height_m: Float32Array, fore: BoolArray, reach_px: float) -> BoolArray:
+def _distance_m(zone_m: Array) -> float:
+    """Return the depth of the middle of a zone (2, 3)."""
+    return float(zone_m[:, 2].mean())
+
+
+def _not_a_crease(height_m: Float32Array, fore: BoolArray, highest_m: float, reach_px: float) -> BoolArray:
     """Return the pixels (h, w) that are high above the support or near some that are."""
-    low = min(_CREASE_M, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
+    low = min(highest_m, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
     high = (fore & (height_m > low)).astype(np.uint8)
     near: BoolArray = ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
     return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)  # a crease surrounds the object
@@ -392,5 +398,5 @@ def nearest_seen_m(frames: Sequence[Frame], masks: Sequence[BoolArray]) -> Float
     seen = [mask & (frame.depth_m > 0.0) for frame, mask in zip(frames, masks, strict=True)]
     depths_m = [np.where(own, frame.depth_m, np.float32(np.inf)) for frame, own in zip(frames, seen, strict=True)]
     nearest = np.stack([depth_m[::stride, ::stride] for depth_m in depths_m]).min(axis=0).astype(np.float32)
-    pixel_m = float(np.median(nearest[np.isfinite(nearest)])) * stride / frames[0].camera.fx
-    return np.asarray(ndimage.minimum_filter(nearest, 2 * round(_MOVED_M / pixel_m) + 1), dtype=np.float32)
+    reach_px = round(_MOVED * frames[0].camera.fx / stride)
+    return np.asarray(ndimage.minimum_filter(nearest, 2 * reach_px + 1), dtype=np.float32)

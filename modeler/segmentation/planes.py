@@ -16,8 +16,7 @@ Real = TypeVar("Real", bound=np.floating[Any])
 # Invisible in the residuals: the axes of turntables and the normals of their plates, measured with three consumer
 # cameras, differ by 3, 4 and 13 mrad.
 _SYSTEMATIC_TILT_RAD = 0.005
-_SYSTEMATIC_OFFSET_M = 0.0005
-_SYSTEMATIC_SHARE = 0.001  # scale error of the depth, relative to the distance of the foot
+_SYSTEMATIC_SHARE = 0.0015  # error of the plane's distance that its residuals do not show, and of the depth's scale
 _MIN_POINTS = 50  # of a plane, and of the ground seen on it
 _TRIM = 3.0  # standard deviations
 _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
@@ -72,14 +71,14 @@ def fit_plane(
     uv = (near - centre) @ axes.T
     residual = heights(near, plane)
     narrow = np.sqrt(max(np.linalg.eigvalsh(np.cov(uv.T))[0], 0.0))
-    if narrow < max(_TRIM * residual.std(), _SYSTEMATIC_OFFSET_M):
+    foot = centre if foot_m is None else foot_m
+    systematic_m = _SYSTEMATIC_SHARE * float(np.linalg.norm(foot))
+    if narrow < max(_TRIM * residual.std(), systematic_m):
         return None
     covariance = _sandwich(uv, residual, weight) + _warp(uv, residual, weight)
-    foot = centre if foot_m is None else foot_m
     at_foot = np.append((foot - centre) @ axes.T, 1.0)
     tilt = np.linalg.eigvalsh(covariance[:2, :2])[-1] + _SYSTEMATIC_TILT_RAD**2
-    share = _SYSTEMATIC_SHARE * float(np.linalg.norm(foot))
-    offset = at_foot @ covariance @ at_foot + _SYSTEMATIC_OFFSET_M**2 + share**2
+    offset = at_foot @ covariance @ at_foot + systematic_m**2
     return Plane(plane[:3], float(plane[3]), float(np.sqrt(tilt)), float(np.sqrt(offset)))
 
 

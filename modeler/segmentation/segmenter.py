@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
-from scipy import ndimage
 
 from modeler.segmentation.background_colour import BackgroundColour, without_background
 from modeler.segmentation.depth_images import (
@@ -17,7 +16,6 @@ from modeler.segmentation.depth_images import (
     planning_stride,
     point_image,
     separate_layers,
-    window_of,
 )
 from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, nearest_seen_m
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
@@ -29,8 +27,6 @@ from modeler.views.sparsity import closed, gap_px, interpolated, measured_share
 _NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
-_RING_PX = (1.5, 2.5)  # distance from a mask at which nothing of the object is left, where it is right to a pixel
-_STEEPEST_SLOPE = np.tan(np.radians(70.0))  # of surfaces that depth cameras measure
 
 _Look = tuple[Frame, Found]
 
@@ -50,8 +46,8 @@ class Segmenter:
     """Largest depth of the object in m; None = no limit."""
     min_points: int = 100
     """Number of pixels below which an object is too small to register."""
-    gap_m: float = 0.012
-    """Largest gap in m between parts of one object."""
+    gap: float = 0.017
+    """Largest gap between parts of one object, as a share of its distance: a dozen pixels of usual cameras."""
     noise: DepthNoise = field(default_factory=DepthNoise)
     """Expected noise of the depth camera; up to three times as much is distinguished from camera motion."""
 
@@ -111,9 +107,9 @@ class Segmenter:
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
-        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support,
-        or if the object's surface continues beyond most of its rim. For sparse measurements, the mask includes the gaps
-        between those of the object.
+        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support.
+        For sparse measurements, the mask includes the gaps between those of the object. An object
+        of which its own mask leaves the rim out is modelled as far as it is seen.
         """
         frame = _interpolated(frame)
         if frame.mask is not None:
@@ -121,8 +117,7 @@ class Segmenter:
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
             loose = plane is not None and self._share_on(plane, frame, mask) > _LOOSE_SHARE
-            thin = not few and self._share_beyond(plane, frame, mask) > MOST
-            outcome = Outcome.UNSURE_MASK if loose or thin else Outcome.CONVERGED
+            outcome = Outcome.UNSURE_MASK if loose else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
@@ -173,7 +168,7 @@ class Segmenter:
     def _find(self, frame: Frame, scene: Scene) -> Found:
         """Return the object in a frame without a mask."""
         noise = scene.noise or self.noise
-        return find(self._kept(frame), frame.camera, scene, noise, gap_m=self.gap_m, occluder=frame.occluder)
+        return find(self._kept(frame), frame.camera, scene, noise, gap=self.gap, occluder=frame.occluder)
 
     def _kept(self, frame: Frame) -> Float32Array:
         """Return the depth (h, w) within region and largest depth, NaN elsewhere."""
@@ -207,26 +202,6 @@ class Segmenter:
         points = _points(frame, stride)
         points = points[mask[::stride, ::stride] & np.isfinite(points[..., 2])].astype(np.float64)
         return float(np.mean(np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[:, 2])))
-
-    def _share_beyond(self, plane: Plane | None, frame: Frame, mask: BoolArray) -> float:
-        """Return the share of the pixels around a mask where its surface continues: no depth step, and no support."""
-        rows, columns = window_of(mask, margin=int(np.ceil(_RING_PX[1])))
-        inside, depth_m = mask[rows, columns], _measured(frame)[rows, columns]
-        outside = ~(inside & np.isfinite(depth_m))
-        away_px = np.asarray(ndimage.distance_transform_edt(outside))
-        nearest = np.asarray(ndimage.distance_transform_edt(outside, return_distances=False, return_indices=True))
-        ring = (away_px > _RING_PX[0]) & (away_px <= _RING_PX[1]) & ~inside
-        if frame.occluder is not None:
-            ring &= ~frame.occluder[rows, columns]
-        if not ring.any():
-            return 0.0
-        rim_m = depth_m[tuple(nearest)][ring]
-        step_m = np.abs(depth_m[ring] - rim_m)
-        goes_on = step_m < self.noise.tolerance_m(rim_m) + away_px[ring] * rim_m / frame.camera.fx * _STEEPEST_SLOPE
-        if plane is not None:
-            points = point_image(depth_m, frame.camera, row=rows.start, column=columns.start)[ring].astype(np.float64)
-            goes_on &= plane.height_m(points) > self.noise.tolerance_m(points[:, 2])
-        return float(goes_on.mean())
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
         """Return the support plane around a masked object, if one is seen."""

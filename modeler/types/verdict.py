@@ -71,11 +71,19 @@ class Verdict:
     checks: Mapping[str, Check] = field(default_factory=dict)
     """By name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
     `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, as available."""
+    tolerance_m: float = 0.0
+    """Error of the surface above which a model is called wrong."""
 
     @property
     def trustworthy(self) -> bool:
         """Whether the model can be trusted."""
         return not self.shortcomings
+
+    @property
+    def trusted_to_m(self) -> float | None:
+        """Error of the surface due to poses that no frame exceeds with 95 % probability; None if it is not trusted."""
+        check = self.checks.get("pose_sd_m")
+        return self.tolerance_m * check.value / check.limit if check is not None and self.trustworthy else None
 
     @property
     def reasons(self) -> tuple[str, ...]:

@@ -293,9 +293,9 @@ def _wider(prior: AbstractPrior, turned_deg: float) -> Remedy | None:
     """Return the limit to raise where a registration ended at a rotation at a limit; None if the prior has none."""
     if isinstance(prior, GeneralPrior | TablePrior) and turned_deg >= prior.max_rotation_deg - _NEAR_LIMIT_DEG:
         return Remedy("allow for larger rotations", {"max_rotation_deg": _twice_deg(prior.max_rotation_deg)})
-    if isinstance(prior, GeneralPrior):
+    if isinstance(prior, GeneralPrior) and prior.max_offset_m is not None:
         return Remedy("allow for larger offsets", {"max_offset_m": f"{2.0 * prior.max_offset_m:g}"})
-    if isinstance(prior, TablePrior | TurntablePrior):
+    if isinstance(prior, TablePrior | TurntablePrior) and prior.max_shift_m is not None:
         return Remedy("allow for larger shifts", {"max_shift_m": f"{2.0 * prior.max_shift_m:g}"})
     return None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -36,13 +36,15 @@ TAIL: Final = 1e-6
 LOOP_TAIL: Final = 1e-3
 """Probability that a run has such loop closure errors by chance; that of the closure gate."""
 MAX_SEEN_THROUGH: Final = 0.1
-"""Share of a frame's surface in the free space of other frames, by more than `WRONG_M`: a model is called wrong if less
-than 90 % of its surface lies within 5 mm of the true one."""
+"""Share of a frame's surface in the free space of other frames, by more than the tolerance: a model is called wrong if
+less than 90 % of its surface lies within it of the true one."""
 MAX_ABSENT: Final = 0.02
 """Share of a frame's surface contradicted by the frames that observe it: 0.005 at most in 17 right runs, five of them
 captures; 0.04 for a box with a post of 3 cm in an upside-down pose."""
-WRONG_M: Final = 0.005
-"""Error above which a surface is called wrong."""
+TOLERANCE: Final = 0.075
+"""Default tolerance on the surface, as a share of the object's size: 5 mm for a box of 15 x 20 x 14 cm."""
+TOLERANCE_SDS: Final = 2.0
+"""The least default tolerance, in standard deviations of the camera's range noise: a single image errs by that."""
 WRONG_RAD: Final = np.radians(3.0)
 """Error above which a rotation is called wrong."""
 WRONG_SHARE: Final = 0.05
@@ -199,7 +201,15 @@ def graph_check(edges: Sequence[Edge], solution: Solution) -> Check | None:
     return Check(float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
-def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]) -> Check:
+def default_tolerance_m(views: Iterable[RayImage]) -> float:
+    """Return the error in m of the surface above which a model is called wrong, unless the user says what it is for."""
+    sizes_m, sigmas_m = np.array([(view.size_m, view.sigma_r_m) for view in views]).reshape(-1, 2).T
+    if not len(sizes_m):
+        return 0.0
+    return float(max(TOLERANCE * np.median(sizes_m), TOLERANCE_SDS * np.median(sigmas_m)))
+
+
+def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage], tolerance_m: float) -> Check:
     """Return the probability that some pair is not at its heaviest mode, by the weights after the graph.
 
     Alternative alignments of segments count likewise. Modes that differ by less than the error limits are one.
@@ -208,6 +218,7 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
         edges: those that take part.
         solution: the poses and the weights.
         views: by frame number.
+        tolerance_m: error of the surface above which a model is wrong.
     """
     settled = 1.0
     for edge in edges:
@@ -219,7 +230,7 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
         alike = [
             float(se3.rotation_angle(se3.inverse(heaviest) @ mode.pose.mean)) <= WRONG_RAD
             and np.linalg.norm(se3.transform(heaviest, centroid_m) - se3.transform(mode.pose.mean, centroid_m))
-            <= WRONG_M
+            <= tolerance_m
             for mode in modes
         ]
         settled *= float(np.sum(np.asarray(weights)[alike]) / np.sum(weights))
@@ -254,33 +265,79 @@ def misfit(edges: Sequence[Edge], solution: Solution) -> float:
 def spread_of_rotations(solution: Solution, factor: float = 1.0) -> Spread | None:
     """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
 
+    What a wrong focal length does to the model is part of its size (`size_check`) and of `spread_of_positions`.
+
     Args:
         solution: the poses.
         factor: on the standard deviations: `misfit`.
     """
-    sigmas_deg = {
-        frame: float(np.degrees(one_axis_sd(factor**2 * covariance[:3, :3], WRONG_RAD)))
-        for frame, covariance in solution.covariances.items()
-    }
+    sigmas_deg = {}
+    for frame, covariance in solution.covariances.items():
+        given_focal = (covariance - _of_focal_length(solution, frame))[:3, :3]
+        sigmas_deg[frame] = float(np.degrees(one_axis_sd(factor**2 * given_focal, WRONG_RAD)))
     return _widest(sigmas_deg, float(np.degrees(WRONG_RAD)))
 
 
-def spread_of_positions(views: Mapping[int, RayImage], solution: Solution, factor: float = 1.0) -> Spread | None:
+def spread_of_positions(
+    views: Mapping[int, RayImage], solution: Solution, tolerance_m: float, factor: float = 1.0
+) -> Spread | None:
     """Return the largest uncertainty of the surface's position in a pose, in m; None without a pose.
 
-    A shift of the surface in all views is not included, because it does not deform the model.
+    What moves the surface of all views alike is not included, because it does not deform the model: a common shift, and
+    the stretch that a wrong focal length causes.
 
     Args:
         views: by frame number; the position is that of a view's centroid.
         solution: the poses.
+        tolerance_m: error of the surface above which a model is wrong.
         factor: on the standard deviations: `misfit`.
     """
-    sigmas_m = {}
+    sigmas_m, deformed_m = {}, deformation_by_focal_length(views, solution)
     for frame, covariance in solution.covariances.items():
         if frame in views and len(views[frame].points_m):
-            of_place = se3.covariance_about(covariance, views[frame].centroid_m)[3:, 3:]
-            sigmas_m[frame] = one_axis_sd(factor**2 * (of_place - _of_common_shift(solution, frame)), WRONG_M)
-    return _widest(sigmas_m, WRONG_M)
+            given_focal = covariance - _of_focal_length(solution, frame)
+            of_place = se3.covariance_about(given_focal, views[frame].centroid_m)[3:, 3:]
+            of_place = of_place - _of_common_shift(solution, frame)
+            given_m = one_axis_sd(factor**2 * of_place, tolerance_m)
+            sigmas_m[frame] = float(np.hypot(given_m, deformed_m.get(frame, 0.0)))
+    return _widest(sigmas_m, tolerance_m)
+
+
+def _of_focal_length(solution: Solution, frame: int) -> Array:
+    """Return the covariance (6, 6) of a pose due to the focal length alone."""
+    focal = solution.focal
+    if focal is None or frame not in focal.by_focal:
+        return np.zeros((6, 6))
+    xi = focal.sigma * se3.adjoint(se3.inverse(solution.trajectory[frame])) @ focal.by_focal[frame]  # eq. 10.6
+    return np.outer(xi, xi)
+
+
+def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solution) -> dict[int, float]:
+    """Return by frame how a focal length wrong by one standard deviation deforms the model, in m (root mean square).
+
+    It stretches every view and moves its pose. What all views have in common, an affine map of the object, changes the
+    size of the model and its proportions by as much as the focal length; the rest puts the views' surfaces apart.
+    """
+    focal = solution.focal
+    frames = [frame for frame in views if focal is not None and frame in focal.by_focal and len(views[frame].points_m)]
+    if focal is None or not frames:
+        return {}
+    places, shifts = [], []
+    for frame in frames:
+        points_m = views[frame].points_m[:: max(len(views[frame].points_m) // _MAX_POINTS, 1)]
+        place_m = se3.transform(solution.trajectory[frame], points_m)
+        stretch_m = -(points_m * [1.0, 1.0, 0.0]) @ solution.trajectory[frame][:3, :3].T
+        by_focal = focal.by_focal[frame]
+        places.append(place_m)
+        shifts.append(focal.sigma * (stretch_m + by_focal[3:] + np.cross(by_focal[:3], place_m)))
+    place_m, shift_m = np.concatenate(places), np.concatenate(shifts)
+    design = np.column_stack([place_m - place_m.mean(axis=0), np.ones(len(place_m))])
+    rest_m = shift_m - design @ np.linalg.lstsq(design, shift_m, rcond=None)[0]
+    ends = np.cumsum([len(place) for place in places])[:-1]
+    return {
+        frame: float(np.sqrt(np.mean(np.sum(part**2, axis=1))))
+        for frame, part in zip(frames, np.split(rest_m, ends), strict=True)
+    }
 
 
 def _of_common_shift(solution: Solution, frame: int) -> Array:
@@ -289,23 +346,6 @@ def _of_common_shift(solution: Solution, frame: int) -> Array:
         return np.zeros((3, 3))
     left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the pose of the graph's root is the identity
     return np.asarray(left @ solution.common_shift_m2 @ left.T, dtype=np.float64)
-
-
-def spread_by_focal_length(views: Mapping[int, RayImage], solution: Solution, frame: int) -> tuple[float, float]:
-    """Return a pose's uncertainty due to the focal length alone: sd of rotation in degrees, and of position in m.
-
-    Args:
-        views: by frame number.
-        solution: the poses.
-        frame: number of one of them.
-    """
-    focal = solution.focal
-    if focal is None or frame not in focal.by_focal:
-        return 0.0, 0.0
-    moved = focal.sigma * focal.by_focal[frame]  # of object coordinates (eq. 10.6)
-    place_m = se3.transform(solution.trajectory[frame], views[frame].centroid_m[None])[0]
-    shift_m = moved[3:] + np.cross(moved[:3], place_m)
-    return float(np.degrees(np.linalg.norm(moved[:3]))), float(np.linalg.norm(shift_m))
 
 
 def one_axis_sd(covariance: Array, wrong: float) -> float:
@@ -351,16 +391,19 @@ def total_depth_scale_sigma(given: float, focal: FocalLength | None) -> float:
     return given if focal is None else math.hypot(given, 0.5 * focal.log_factor)
 
 
-def size_check(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], depth_scale_sigma: float) -> Check:
-    """Return the uncertainty of the surface in m due to that of the depth scale.
+def size_check(
+    views: Mapping[int, RayImage], trajectory: Mapping[int, Array], scale_sigma: float, tolerance_m: float
+) -> Check:
+    """Return the uncertainty of the surface in m due to that of the model's scale.
 
-    A model is called wrong if less than 90 % of its surface lies within `WRONG_M`: its reach is the distance from its
-    centre within which 90 % of the points lie.
+    A model is called wrong if less than 90 % of its surface lies within the tolerance: its reach is the distance from
+    its centre within which 90 % of the points lie.
 
     Args:
         views: by frame number.
         trajectory: object_from_camera (4, 4) by frame number.
-        depth_scale_sigma: standard deviation of the depth scale's logarithm.
+        scale_sigma: standard deviation of the scale's logarithm.
+        tolerance_m: error of the surface above which a model is wrong.
     """
     surfaces_m = [
         se3.transform(trajectory[frame], view.points_m[:: max(len(view.points_m) // _MAX_POINTS, 1)])
@@ -369,7 +412,7 @@ def size_check(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], d
     ]
     surface_m = np.concatenate(surfaces_m) if surfaces_m else np.zeros((1, 3))
     reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_SEEN_THROUGH)
-    return Check(depth_scale_sigma * float(reach_m), WRONG_M)
+    return Check(scale_sigma * float(reach_m), tolerance_m)
 
 
 @dataclass(frozen=True)
@@ -386,15 +429,16 @@ class FreeSpace:
     """That share: points in the free space of two frames or more, and of most of those that observe them."""
 
 
-def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> FreeSpace | None:
+def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], tolerance_m: float) -> FreeSpace | None:
     """Return the free-space violations between frames; None if none can be evaluated.
 
     A surface point of one frame is transformed into another, where it faces the camera. If the pixel and those around
-    it measured something farther away by more than `WRONG_M`, there is no surface: one of the two poses is wrong.
+    it measured something farther away by more than the tolerance, there is no surface: one of the two poses is wrong.
 
     Args:
         views: by frame number.
         trajectory: object_from_camera (4, 4) by frame number.
+        tolerance_m: error of the surface above which a model is wrong.
     """
     frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MAX_VIEWS)).astype(int))
@@ -409,7 +453,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -
                 target_from_source = se3.inverse(trajectory[other]) @ trajectory[frame]
                 carried_m, turned = se3.transform(target_from_source, points_m), normals @ target_from_source[:3, :3].T
                 beyond_m = _beyond(views[other], reaches_m[other], carried_m, turned)
-                found = np.stack([beyond_m > WRONG_M, np.abs(beyond_m) <= WRONG_M])
+                found = np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
                 tally += found
                 looks[[row, column]] += found.sum(axis=1)  # which of the two is wrong is unknown
         through, judged = tally[0], tally.sum(axis=0) >= 2

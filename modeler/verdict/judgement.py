@@ -35,8 +35,9 @@ from modeler.types import (
 )
 from modeler.verdict.evidence import (
     MAX_UNSURE,
-    WRONG_M,
     contradiction,
+    default_tolerance_m,
+    deformation_by_focal_length,
     displacement,
     free_space,
     graph_check,
@@ -46,7 +47,6 @@ from modeler.verdict.evidence import (
     prior_check,
     prior_distances,
     size_check,
-    spread_by_focal_length,
     spread_of_positions,
     spread_of_rotations,
     total_depth_scale_sigma,
@@ -63,6 +63,7 @@ def judged(
     closure_expected: bool = False,
     prior: AbstractPrior | None = None,
     depth_scale_sigma: float = 0.0,
+    tolerance_m: float | None = None,
 ) -> Verdict:
     """Judge the model of a run. Evidence is gathered after the last step, when all edges are in.
 
@@ -72,8 +73,10 @@ def judged(
         closure_expected: whether the object is known to come back to its start.
         prior: of the motions; None: not known here.
         depth_scale_sigma: standard deviation of the depth scale's logarithm, as the camera was given; 0 = exact.
+        tolerance_m: error of the surface above which a model is wrong; None: `default_tolerance_m`.
     """
     reasons, frames = [], step.frames_so_far
+    tolerance_m = default_tolerance_m(step.views.values()) if tolerance_m is None else tolerance_m
     if interrupted:
         reasons.append(Shortcoming("interrupted", f"the run was interrupted after frame {step.frame.index}"))
     elif not step.last:
@@ -83,14 +86,16 @@ def judged(
         reasons.append(Shortcoming("too_few_frames", words))
     edges = [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
     reasons += [Shortcoming("left_out", words) for words in _left_out(frames, segments(edges))]
-    found = _found(step, frames, edges, prior) if step.last else []
+    found = _found(step, frames, edges, prior, tolerance_m) if step.last else []
     reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _little_overlap(edges)
     reasons += _unconfirmed_join(edges)
-    spreads = [*_spreads(step, edges), *_size(step, depth_scale_sigma)] if step.last else []
+    spreads = []
+    if step.last:
+        spreads = [*_spreads(step, edges, tolerance_m), *_size(step, depth_scale_sigma, tolerance_m)]
     reasons += _against(spreads)
-    return Verdict(tuple(reasons), {finding.name: finding.check for finding in (*found, *spreads)})
+    return Verdict(tuple(reasons), {finding.name: finding.check for finding in (*found, *spreads)}, tolerance_m)
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,11 @@ def _against(found: Sequence[_Finding]) -> list[Shortcoming]:
 
 
 def _found(
-    step: Step, frames: Sequence[FrameRecord], edges: Sequence[Edge], prior: AbstractPrior | None
+    step: Step,
+    frames: Sequence[FrameRecord],
+    edges: Sequence[Edge],
+    prior: AbstractPrior | None,
+    tolerance_m: float,
 ) -> list[_Finding]:
     """Return the evidence of a whole run.
 
@@ -120,6 +129,7 @@ def _found(
         frames: results of all frames.
         edges: those that take part.
         prior: of the motions.
+        tolerance_m: error of the surface above which a model is wrong.
     """
     views, solution, found = step.views, step.solution, []
     accepted = [frame for frame in frames if frame.accepted]
@@ -158,10 +168,10 @@ def _found(
             f"expected from their covariances (up to {fit.limit:.1f} by chance)"
         )
         found.append(_Finding("graph_chi2", fit, "edges_disagree", words))
-    if (free := free_space(views, solution.trajectory)) is not None:
+    if (free := free_space(views, solution.trajectory, tolerance_m)) is not None:
         words = (
             f"{100.0 * free.seen_through.value:.0f} % of the surface of frame {free.frame} violates the free space of "
-            f"other frames by more than {1000.0 * WRONG_M:.0f} mm: {_NO_SURFACE}"
+            f"other frames by more than {1000.0 * tolerance_m:.1f} mm: {_NO_SURFACE}"
         )
         found.append(_Finding("seen_through", free.seen_through, "seen_through", words))
         words = (
@@ -169,25 +179,24 @@ def _found(
             f"most frames that observe it: {_NO_SURFACE}"
         )
         found.append(_Finding("absent", free.absent, "absent", words))
-    others = other_modes(edges, solution, views)
+    others = other_modes(edges, solution, views, tolerance_m)
     words = f"with a probability of {100.0 * others.value:.0f} %, some pair is at a wrong mode"
     found.append(_Finding("other_modes", others, "other_modes", words))
     return found
 
 
-def _spreads(step: Step, edges: Sequence[Edge]) -> list[_Finding]:
+def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Finding]:
     """Return the uncertainty of the poses of a whole run."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
     if (turn := spread_of_rotations(step.solution, factor)) is not None:
         words = f"the rotation of frame {turn.frame} is uncertain by {turn.check.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.check.limit:.1f}°" if turn.count > 1 else ""
-        by_focal_deg, _ = spread_by_focal_length(step.views, step.solution, turn.frame)
-        found.append(_explained(_Finding("pose_sd_deg", turn.check, "unsure_rotation", words), by_focal_deg, focal))
-    if (place := spread_of_positions(step.views, step.solution, factor)) is not None:
+        found.append(_Finding("pose_sd_deg", turn.check, "unsure_rotation", words))
+    if (place := spread_of_positions(step.views, step.solution, tolerance_m, factor)) is not None:
         value_mm, limit_mm = 1000.0 * place.check.value, 1000.0 * place.check.limit
         words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
         words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""
-        _, by_focal_m = spread_by_focal_length(step.views, step.solution, place.frame)
+        by_focal_m = deformation_by_focal_length(step.views, step.solution).get(place.frame, 0.0)
         found.append(_explained(_Finding("pose_sd_m", place.check, "unsure_place", words), by_focal_m, focal))
     return found
 
@@ -206,15 +215,16 @@ def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> 
     return replace(spread, code="unsure_focal", words=f"{spread.words}, {why}")
 
 
-def _size(step: Step, depth_scale_sigma: float) -> list[_Finding]:
-    """Return the uncertainty of the model's size, if the depth scale is not exact."""
-    depth_scale_sigma = total_depth_scale_sigma(depth_scale_sigma, step.solution.focal)
-    if depth_scale_sigma == 0.0:
+def _size(step: Step, depth_scale_sigma: float, tolerance_m: float) -> list[_Finding]:
+    """Return the uncertainty of the model's size, unless depth scale and focal length are exact."""
+    focal = step.solution.focal
+    sigma = float(np.hypot(total_depth_scale_sigma(depth_scale_sigma, focal), 0.0 if focal is None else focal.sigma))
+    if sigma == 0.0:
         return []
-    check = size_check(step.views, step.solution.trajectory, depth_scale_sigma)
+    check = size_check(step.views, step.solution.trajectory, sigma, tolerance_m)
     words = (
-        f"the model's size is known only to {100.0 * depth_scale_sigma:.0f} %, {1000.0 * check.value:.0f} mm of its "
-        "surface: loops cannot separate errors of focal length and depth"
+        f"the model's size is known only to {100.0 * sigma:.0f} %, {1000.0 * check.value:.1f} mm of its surface: focal "
+        "length or depth scale are uncertain"
     )
     return [_Finding("size_m", check, "unsure_size", words)]
 

@@ -64,8 +64,9 @@ class VisibilityRegistrar(AbstractRegistrar):
     """Largest number of modes that are sampled."""
     min_points: int = 20
     """Views with fewer surface points are not registered: they do not determine the noise of matching surface."""
-    min_overlap: float = 0.5
-    """Least fraction of matches in the surface that both views should see."""
+    min_overlap: float = 0.4
+    """Least fraction of matches in the surface that both views should see, as of further edges (`Thresholds`). With
+    less than a half, the verdict wants another edge to confirm the registration."""
     max_at_limit: float = 0.2
     """Largest fraction of the samples at the limit of the prior."""
     max_sigma_deg: float = 10.0
