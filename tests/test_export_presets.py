@@ -13,7 +13,7 @@ from run_builders import ball
 
 from modeler import se3
 from modeler.export import solids
-from modeler.export.checks import Checks, mesh_checks
+from modeler.runs.presets import Checks, mesh_checks
 from modeler.sequences import open_sequence
 from modeler.types import Array, InputError, ObjectModel
 

@@ -28,9 +28,8 @@ from modeler.fusion.symmetries import Axis
 from modeler.types import Array
 from modeler.viz import entities, reader
 from modeler.viz.report import run_data, write_page
-from modeler.viz.report.evidence import CHECKS
 from modeler.viz.report.mesh import read_mesh, scene
-from modeler.viz.report.page import rotation_words
+from modeler.viz.report.page import CHECKS, rotation_words
 from modeler.viz.report.run_data import Result, recorded, surfaces
 from modeler.viz.stream import open_stream
 

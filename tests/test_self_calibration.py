@@ -13,7 +13,7 @@ import tabletop
 
 from modeler import se3
 from modeler.cli import main
-from modeler.graph.self_calibration import FocalCalibrator
+from modeler.graph.focal import FocalCalibrator
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
 from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor

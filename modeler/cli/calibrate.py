@@ -131,7 +131,7 @@ class CalibrateCamera:
             InputError: if the run cannot be used or the file cannot be written.
         """
         from modeler.export import write_atomically
-        from modeler.graph.self_calibration import FocalCalibrator
+        from modeler.graph.focal import FocalCalibrator
         from modeler.runs.outputs import check_files, run_inputs
         from modeler.runs.reopening import reopened
         from modeler.sequences import FocalFactor

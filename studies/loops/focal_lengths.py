@@ -19,7 +19,7 @@ import numpy as np
 
 from modeler.closure import Closer
 from modeler.export import write_atomically
-from modeler.graph.self_calibration import FocalCalibrator
+from modeler.graph.focal import FocalCalibrator
 from modeler.segmentation import scene_frames
 from modeler.sequences import FocalFactor, RefocusedSequence
 from modeler.types import Step
