@@ -8,8 +8,8 @@ from typing import Final, final
 import numpy as np
 
 from modeler.sequences.rendering.recipe import Recipe
-from modeler.sequences.rendering.renderer import Stage
 from modeler.suggestion import Belief, Candidate
+from studies.table_stage import Stage
 
 TURN_SIGMA_DEG: Final = 2.0
 """Standard deviation of its turns: about that of a person with a mark to turn by."""

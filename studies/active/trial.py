@@ -16,13 +16,13 @@ from modeler.pipeline import Modeler
 from modeler.pipeline.modeler import Run
 from modeler.priors import TablePrior
 from modeler.sequences.rendering.recipe import Recipe
-from modeler.sequences.rendering.renderer import Stage
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.pose_gain import edge_information
 from modeler.types import Array, Step
 from modeler.views import Sensor
 from studies.active.robot import SimulatedRobot
 from studies.calibration.specimens import load_specimen
+from studies.table_stage import Stage
 
 Policy = Literal["suggest", "random", "even"]
 EVEN_DEG = 25.0

@@ -16,13 +16,14 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import HeldPrior
 from modeler.sequences import AbstractSequence
 from modeler.sequences.hand_shapes import HandMarkedSequence, HandShape
-from modeler.sequences.rendering.renderer import RenderedSequence, matrix_of, place_of
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Box, Compound, placement
 from modeler.sequences.rendering.trajectory import Hand, Place, Places
 from modeler.types import Array, HandPoses, Step
 from studies.calibration.specimens import load_specimen
 from studies.scenes.occluded import gripper
 from studies.scenes.plan import reach_m
+from studies.table_stage import matrix_of, place_of
 from studies.trust.plan import viewed
 from studies.trust.stage import Recorded, Stage, posed
 from studies.trust.study import f_score

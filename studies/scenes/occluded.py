@@ -12,12 +12,13 @@ import numpy as np
 from modeler.composition import compose
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.sequences.rendering.recipe import Recipe
-from modeler.sequences.rendering.renderer import RenderedSequence, matrix_of, place_of
+from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Box, Compound, Part, placement
 from modeler.sequences.rendering.trajectory import Place, Places, Tabletop
 from modeler.types import BoolArray, Step
 from studies.calibration.specimens import load_specimen
 from studies.scenes.plan import arm, reach_m, thing
+from studies.table_stage import matrix_of, place_of
 from studies.trust.plan import SHIFT_M, viewed
 from studies.trust.stage import Recorded, Stage, posed
 from studies.trust.study import f_score, pose_errors
