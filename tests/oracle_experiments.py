@@ -12,6 +12,7 @@ from modeler import se3
 from modeler.experiment import Experiment, Pairing, Trial
 from modeler.priors import GeneralPrior
 from modeler.types import (
+    NOMINAL_FOCAL,
     AbstractPoseDensity,
     AbstractRegistrar,
     Array,
@@ -45,7 +46,7 @@ class Recording:
         return POSES if self.known else None
 
     def sensor(self) -> SensorNoise | None:
-        return SensorNoise(0.002, 0.001)
+        return SensorNoise(0.002, 0.001, sigma_focal=NOMINAL_FOCAL)
 
 
 @dataclass(frozen=True)

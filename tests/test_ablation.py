@@ -26,7 +26,7 @@ def case() -> Case:
     truth, noise = sequence.truth(), sequence.sensor()
     assert truth is not None
     assert noise is not None
-    target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (0, 1))
+    target, source = (Sensor(noise).ray_image(sequence.frame(index)) for index in (0, 1))
     density = GeneralPrior().between(source, target)
     return Case("shapes", "box", "n-fold", "general", source, target, density, true_motion(truth, 0, 1), 0)
 

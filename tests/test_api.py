@@ -41,7 +41,7 @@ from modeler.sequences import bundled, open_sequence
 sequence = open_sequence(bundled("box"))
 frames = [sequence.frame(index) for index in (0, 1)]
 def registered(seed):
-    target, source = (Sensor(*sequence.sensor()).ray_image(frame) for frame in frames)
+    target, source = (Sensor(sequence.sensor()).ray_image(frame) for frame in frames)
     density = GeneralPrior().between(source, target)
     return VisibilityRegistrar().register(source, target, density, rng=numpy.random.default_rng(seed)).usable
 registered(0)

@@ -13,7 +13,7 @@ from input_errors import refused
 from PIL import Image
 
 from modeler.sequences import BopSequence, open_sequence, survey, write_bop
-from modeler.types import Frame, InputError, SensorNoise
+from modeler.types import NOMINAL_FOCAL, Frame, InputError, SensorNoise
 from studies.formats.image_folders import png_claiming
 
 
@@ -49,7 +49,7 @@ def test_reading_undoes_writing(scene: Path, frames: list[Frame], truth: dict[in
     for index in INDICES:
         np.testing.assert_allclose(read_truth[index], truth[index], atol=1e-12)
     assert sequence.name == "thing"
-    assert sequence.sensor() == SensorNoise(1e-3, 2e-3)
+    assert sequence.sensor() == SensorNoise(1e-3, 2e-3, sigma_focal=NOMINAL_FOCAL)
     assert sequence.motion == {"kind": "table", "step_deg": 25}
 
 

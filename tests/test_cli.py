@@ -18,8 +18,9 @@ from command_runner import BOX, FILES, Run
 
 from modeler import priors, se3
 from modeler.baselines import kiss
+from modeler.cli import main
 from modeler.cli.console import Interrupt
-from modeler.composition import compose, main
+from modeler.composition import compose
 from modeler.composition.compose import comes_back
 from modeler.composition.options import PriorOptions
 from modeler.export import RunFolder, model_upright

@@ -30,6 +30,7 @@ from modeler.types import (
     InputError,
     Posterior,
     RayImage,
+    SensorNoise,
     Solution,
 )
 from modeler.views import Sensor
@@ -87,7 +88,7 @@ def test_limits_that_are_assumed_are_left_as_a_registration_leaves_them(*, assum
 @pytest.mark.parametrize("assumed", [True, False])
 @pytest.mark.parametrize("method", [Oracle(), ContradictedWithin()])
 def test_a_trial_is_what_register_gives_of_the_pair(method: AbstractRegistrar, assumed: bool) -> None:
-    prior, recording, sensor = GeneralPrior(limits_assumed=assumed), Recording(), Sensor(0.002, 0.001)
+    prior, recording, sensor = GeneralPrior(limits_assumed=assumed), Recording(), Sensor(SensorNoise(0.002, 0.001))
     single = Modeler(prior=prior, registrar=method, sensor=sensor, seed=3)
     scene = single.segmenter.scene([recording.frame(index) for index in recording.indices])
     for found in experiment(methods={"one": method}, prior=prior, seed=3).trials(recording):

@@ -14,7 +14,7 @@ from modeler.kernels import point_to_plane
 from modeler.priors import GeneralPrior
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility.points import FixedPattern
-from modeler.types import Posterior, RayImage
+from modeler.types import Posterior, RayImage, SensorNoise
 from modeler.views import Sensor
 
 PATTERN = FixedPattern(share=0.6, area_px=40.0)
@@ -61,7 +61,7 @@ def test_its_reach_is_that_of_the_area_over_which_errors_are_alike() -> None:
 def ball_views(share: float, seed: int) -> list[RayImage]:
     """Two views, 15° apart, of a ball by a camera whose error is the same in both."""
     noise = gaussian_filter(np.random.default_rng(seed).normal(size=(160, 200)), WIDTH_PX)
-    sensor = Sensor(sigma_r_m=0.001, noise_area_px=4.0 * np.pi * WIDTH_PX**2, pattern_share=share)
+    sensor = Sensor(SensorNoise(sigma_r_m=0.001), noise_area_px=4.0 * np.pi * WIDTH_PX**2, pattern_share=share)
     found = []
     for index, pose in enumerate(tabletop.turntable(24)[:2]):
         frame = tabletop.view(tabletop.BALL, pose, index).frame

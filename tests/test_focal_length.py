@@ -30,6 +30,7 @@ from modeler.types import (
     FocalLength,
     ObjectModel,
     PoseGaussian,
+    SensorNoise,
     Solution,
     Step,
 )
@@ -41,7 +42,7 @@ def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
     sequence, prior, step = open_sequence(bundled("box")), GeneralPrior(), 0.02
     noise = sequence.sensor()
     assert noise is not None
-    sensor = Sensor(*noise[:3], sigma_focal=step)
+    sensor = Sensor(noise._replace(sigma_focal=step))
     target, source = (sensor.ray_image(sequence.frame(index)) for index in (1, 2))
 
     def registered(log_factor: float, seed: int) -> PoseGaussian:
@@ -123,7 +124,7 @@ def test_a_prior_that_knows_the_motion_keeps_it_under_every_focal_length(rng: np
 
 def test_poses_are_scored_under_a_focal_length_as_views_that_were_made_with_it() -> None:
     sequence, step = open_sequence(bundled("box")), 0.01
-    sensor = Sensor(*(sequence.sensor() or ()))
+    sensor = Sensor(sequence.sensor() or SensorNoise())
     source, target = (sensor.ray_image(sequence.frame(index)) for index in (2, 1))
     truth = sequence.truth()
     assert truth is not None
@@ -258,7 +259,7 @@ def built(sigma_focal: float) -> tuple[Step, dict[int, Array]]:
     assert noise is not None
     assert truth is not None
     wrong = RefocusedSequence(whole, FocalFactor(1.03, whole.frame(0).camera.fx))
-    modeler = Modeler(sensor=Sensor(*noise[:3], sigma_focal=sigma_focal), prior=TablePrior())
+    modeler = Modeler(sensor=Sensor(noise._replace(sigma_focal=sigma_focal)), prior=TablePrior())
     frames = list(wrong)
     *_, last = modeler.run(frames, modeler.segmenter.scene(frames))
     assert isinstance(last, Step)

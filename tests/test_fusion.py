@@ -419,7 +419,7 @@ def test_bundled_objects_are_fused_within_3_mm(name):
     truth, noise = sequence.truth(), sequence.sensor()
     assert truth is not None
     assert noise is not None
-    sensor = Sensor(*noise)
+    sensor = Sensor(noise)
     frames = {frame.index: frame for frame in sequence}
     model = Fuser().fuse(
         {k: sensor.ray_image(frame) for k, frame in frames.items()}, {k: se3.inverse(pose) for k, pose in truth.items()}

@@ -16,7 +16,7 @@ from modeler.kernels import gpu, paper
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.se3 import rows
 from modeler.sequences import bundled
-from modeler.types import Plane
+from modeler.types import Plane, SensorNoise
 from modeler.views import Sensor
 
 with_warp = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
@@ -29,7 +29,7 @@ def standing(index):
     up = pose[:3, 2]
     plane = Plane(up, -float(up @ (pose @ [0.0, 0.0, -BOX.depth_m, 1.0])[:3]), 5e-3, 5e-4)
     frame = tabletop.view(BOX, pose, index, rng=np.random.default_rng(index)).frame
-    return Sensor(sigma_wh=0.002, sigma_r_m=0.001).ray_image(frame, plane)
+    return Sensor(SensorNoise(0.002, 0.001)).ray_image(frame, plane)
 
 
 @pytest.fixture(params=["warp-cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

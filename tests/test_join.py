@@ -25,7 +25,7 @@ from modeler.sequences.rendering.recipe import Recipe, Table, Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
 from modeler.sequences.rendering.trajectory import Turntable
-from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, Stated, Step
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, SensorNoise, Stated, Step
 from modeler.views import Sensor
 from modeler.viz import entities
 from modeler.viz.report.run_data import cloud, recorded
@@ -61,7 +61,7 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
     """Write the scene folder of a sequence, and the run folder of a build of it that found every motion."""
     truth, (sigma_wh, sigma_r_m, *_) = sequence.truth(), sequence.sensor()
     write_bop(scene, sequence, truth, {"sensor": {"sigma_wh": sigma_wh, "sigma_r_m": sigma_r_m}})
-    views = {frame.index: Sensor(sigma_wh, sigma_r_m).ray_image(frame) for frame in BopSequence(scene)}
+    views = {frame.index: Sensor(SensorNoise(sigma_wh, sigma_r_m)).ray_image(frame) for frame in BopSequence(scene)}
     edges = []
     for before, after in [*zip(sequence.indices, sequence.indices[1:], strict=False), (0, sequence.indices[-1])]:
         pose = PoseGaussian(truth[before] @ se3.inverse(truth[after]), COVARIANCE)

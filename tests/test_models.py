@@ -31,7 +31,7 @@ def modelled() -> Modelled:
     truth, noise, mesh = recorded.truth(), recorded.sensor(), true_mesh(recorded)
     assert truth is not None
     assert noise is not None
-    views = {frame: Sensor(*noise).ray_image(recorded.frame(frame), None) for frame in (0, 4, 9)}
+    views = {frame: Sensor(noise).ray_image(recorded.frame(frame), None) for frame in (0, 4, 9)}
     object_from_model = se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.1]))
     trajectory = {frame: object_from_model @ se3.inverse(truth[frame]) for frame in views}
     model = FUSER.fuse(views, trajectory)

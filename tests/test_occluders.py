@@ -23,7 +23,7 @@ from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import BopSequence, open_sequence, write_bop
-from modeler.types import BoolArray, Frame, InputError, Outcome
+from modeler.types import BoolArray, Frame, InputError, Outcome, SensorNoise
 from modeler.views import Sensor
 from studies.formats.image_folders import write_open3d, write_tum
 
@@ -183,7 +183,7 @@ def test_a_hand_that_touches_the_object_is_no_part_of_it_where_it_is_marked(rng)
     segmenter = Segmenter()
     scene = segmenter.scene(frames)
     for frame, mask, hand in zip(frames, masks, hands, strict=True):
-        prepared = prepare(frame, scene, segmenter, Sensor(0.001, 0.001))
+        prepared = prepare(frame, scene, segmenter, Sensor(SensorNoise(0.001, 0.001)))
         assert iou(prepared.segmentation.mask, mask) > 0.94
         assert prepared.view is not None
         assert np.isnan(prepared.view.frame.depth_m[hand]).all()

@@ -36,7 +36,7 @@ def turned(name: str) -> tuple[Views, Array]:
     noise, truth = sequence.sensor(), sequence.truth()
     assert noise is not None
     assert truth is not None
-    loop, frames = Modeler(sensor=Sensor(*noise)), [sequence.frame(index) for index in (0, 1)]
+    loop, frames = Modeler(sensor=Sensor(noise)), [sequence.frame(index) for index in (0, 1)]
     first, second = (loop.prepare(frame, loop.segmenter.scene(frames)).view for frame in frames)
     assert first is not None
     assert second is not None

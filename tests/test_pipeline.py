@@ -37,6 +37,7 @@ from modeler.types import (
     RayImage,
     Refining,
     Segmentation,
+    SensorNoise,
     SharedAxis,
     Solution,
     Step,
@@ -328,7 +329,7 @@ def test_covariances_account_for_the_noise_of_a_frame_in_all_its_edges() -> None
 
 
 def test_covariances_include_a_bias_of_all_distances_unless_the_focal_length_is_exact() -> None:
-    noisy = {"registrar": Oracle(noise=0.3), "sensor": Sensor(sigma_focal=0.02)}
+    noisy = {"registrar": Oracle(noise=0.3), "sensor": Sensor(SensorNoise(sigma_focal=0.02))}
     last, without = (run(**noisy, common_distance=sigma)[-1] for sigma in (0.01, 0.0))
     shift_m = 0.01 * np.mean([view.centroid_m for view in last.views.values()], axis=0)
     for frame in range(1, 9):

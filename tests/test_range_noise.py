@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from modeler import se3
 from modeler.registration import VisibilityLikelihood
 from modeler.segmentation import Segmenter
-from modeler.types import Camera, Frame
+from modeler.types import Camera, Frame, SensorNoise
 from modeler.views import Sensor
 from modeler.views.range_noise import range_noise
 
@@ -96,9 +96,8 @@ def test_a_scene_tells_the_sensor() -> None:
     noise = scene.range_noise
     assert noise is not None
     assert noise.pattern_share is not None
-    assert Sensor(0.001, 0.0007).measured(noise) == Sensor(
-        0.001,
-        0.0007,
+    assert Sensor(SensorNoise(0.001, 0.0007)).measured(noise) == Sensor(
+        SensorNoise(0.001, 0.0007),
         noise_area_px=noise.area_px,
         sigma_inverse_per_m=noise.sigma_inverse_per_m,
         pixel_sigma_inverse_per_m=noise.pixel_sigma_inverse_per_m,
@@ -110,7 +109,7 @@ def test_a_scene_tells_the_sensor() -> None:
 
 def test_balls_are_smaller_where_planes_show_less_noise_than_stated() -> None:
     frame = plane_frame(1e-3, 0.0)
-    stated = Sensor(sigma_r_m=0.004, min_neighbours=5.0)
+    stated = Sensor(SensorNoise(sigma_r_m=0.004), min_neighbours=5.0)
 
     def ball_px(sensor: Sensor) -> float:
         return sensor.ray_image(frame).error_area_px - sensor.noise_area_px
@@ -122,7 +121,9 @@ def test_balls_are_smaller_where_planes_show_less_noise_than_stated() -> None:
 
 def test_the_more_pixels_err_alike_the_fewer_patches_a_view_has() -> None:
     frame = plane_frame(1e-3, 0.0)
-    views = [Sensor(0.001, 0.0007, noise_area_px=area_px).ray_image(frame) for area_px in (1.0, 10.0, 100.0)]
+    views = [
+        Sensor(SensorNoise(0.001, 0.0007), noise_area_px=area_px).ray_image(frame) for area_px in (1.0, 10.0, 100.0)
+    ]
     counts = [view.patches for view in views]
     assert counts[0] > counts[1] > counts[2]
     # Two correlated areas each beside the ball: method, eq. 1.4.
@@ -135,7 +136,7 @@ def test_views_of_a_noisy_camera_overlap_where_they_fit() -> None:
     poses = tabletop.turntable(24)[:2]
     shared = {}
     for told in (0.0, sigma_m / 0.76**2):
-        sensor = Sensor(0.001, 0.001, noise_area_px=4.0 * np.pi * width_px**2, sigma_inverse_per_m=told)
+        sensor = Sensor(SensorNoise(0.001, 0.001), noise_area_px=4.0 * np.pi * width_px**2, sigma_inverse_per_m=told)
         views = []
         for index, pose in enumerate(poses):
             frame = tabletop.view(tabletop.BRICK, pose, index).frame

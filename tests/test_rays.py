@@ -8,7 +8,7 @@ from modeler.evaluation import about_point, true_motion
 from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.sequences.rendering.renderer import RenderedSequence
-from modeler.types import Camera, Frame
+from modeler.types import Camera, Frame, SensorNoise
 from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, rendered_views, staged
@@ -31,7 +31,7 @@ def sunk_m(sigma_r_m):
     """Return how far behind its surface a rod's points lie on average under a sensor's noise."""
     depth_m = rod().astype(np.float32)
     frame = Frame(0, 0.0, depth_m, CAMERA, mask=depth_m > 0.0)
-    view = Sensor(0.001, sigma_r_m).ray_image(frame)
+    view = Sensor(SensorNoise(0.001, sigma_r_m)).ray_image(frame)
     assert len(view.points_m) > 200
     from_axis_m = np.hypot(view.points_m[:, 0], view.points_m[:, 2] - AXIS_M)
     return float(np.mean(RADIUS_M - from_axis_m))

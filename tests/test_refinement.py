@@ -27,7 +27,7 @@ def bundled_pair(name):
     truth, noise = sequence.truth(), sequence.sensor()
     assert truth is not None
     assert noise is not None
-    target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (0, 1))
+    target, source = (Sensor(noise).ray_image(sequence.frame(index)) for index in (0, 1))
     pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
     return pair, true_motion(truth, target=0, source=1), source.centroid_m
 

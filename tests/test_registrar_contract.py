@@ -20,6 +20,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    SensorNoise,
 )
 from modeler.views import Sensor
 
@@ -71,7 +72,7 @@ class Carried(AbstractPoseDensity):
 def view(index: int) -> RayImage:
     """Return frame `index` of a box that turns by 15° a frame and shows three faces, with depth noise."""
     frame = tabletop.view(BODY, POSES[index], index, rng=np.random.default_rng(index), table=False).frame
-    return Sensor(sigma_wh=0.002, sigma_r_m=0.001).ray_image(frame)
+    return Sensor(SensorNoise(0.002, 0.001)).ray_image(frame)
 
 
 def empty(index: int) -> RayImage:

@@ -112,6 +112,6 @@ def bowls(seed: int) -> tuple[RayImage, RayImage, Array]:
     assert noise is not None
     frames = [sequence.frame(index) for index in (0, 1)]
     scene = segmenter.scene(frames)
-    sensor = Sensor(*noise).measured(scene.range_noise)
+    sensor = Sensor(noise).measured(scene.range_noise)
     target, source = (sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for frame in frames)
     return source, target, true_motion(truth, target=0, source=1)

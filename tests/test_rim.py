@@ -50,7 +50,7 @@ def boxes(target: int, nearer_m: float) -> tuple[RayImage, RayImage, Array]:
         frame = sequence.frame(index)
         assert frame.mask is not None
         depth_m = frame.depth_m - nearer_m * np.where(frame.mask, rim_weights(frame.mask), 0.0)
-        views.append(Sensor(*noise).ray_image(replace(frame, depth_m=depth_m.astype(np.float32), colour=None)))
+        views.append(Sensor(noise).ray_image(replace(frame, depth_m=depth_m.astype(np.float32), colour=None)))
     return views[1], views[0], true_motion(truth, target=target, source=target + 1)
 
 

@@ -29,7 +29,7 @@ def views(name, source, target):
     truth, noise = sequence.truth(), sequence.sensor()
     assert truth is not None
     assert noise is not None
-    sensor = Sensor(*noise)
+    sensor = Sensor(noise)
     made = [sensor.ray_image(sequence.frame(index)) for index in (source, target)]
     return *made, true_motion(truth, target=target, source=source)
 

@@ -17,11 +17,11 @@ from modeler.graph.focal import FocalCalibrator
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior
 from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequence, read_focal_factor
-from modeler.types import AbstractPrior, Edge, FocalLength, Outcome, Posterior, RayImage, Stated
+from modeler.types import AbstractPrior, Edge, FocalLength, Outcome, Posterior, RayImage, SensorNoise, Stated
 from modeler.views import Sensor
 
 STEPS = 12
-SENSOR = Sensor(sigma_r_m=1e-3, sigma_focal=0.02)
+SENSOR = Sensor(SensorNoise(sigma_r_m=1e-3, sigma_focal=0.02))
 MODELER = Modeler(sensor=SENSOR)
 
 

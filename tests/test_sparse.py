@@ -14,7 +14,7 @@ from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences.rendering.renderer import RenderedSequence
-from modeler.types import Camera, Frame, Outcome, Step
+from modeler.types import Camera, Frame, Outcome, SensorNoise, Step
 from modeler.views import Sensor
 from modeler.views.sparsity import closed, gap_px, measured_share, nearest_depth
 from studies.calibration.specimens import load_specimen
@@ -84,7 +84,7 @@ def test_planes_between_sparse_measurements_err_as_they_state(rng):
     for _ in range(8):
         depth_m = (exact + exact**2 * sigma_m * rng.normal(size=SHAPE)).astype(np.float32)
         frame = thinned(Frame(0, 0.0, depth_m, CAMERA, mask=np.ones(SHAPE, dtype=bool)), 0.1, rng)
-        view = Sensor(0.001, sigma_m).ray_image(frame)
+        view = Sensor(SensorNoise(0.001, sigma_m)).ray_image(frame)
         normal = np.array([-0.3, 0.4, 1.2])
         off_m = (view.points_m @ normal - 1.0) / np.linalg.norm(normal)
         ratios.append(np.mean(off_m**2 / view.layers["variance_m2"]))
@@ -120,7 +120,7 @@ def test_sparse_frames_show_the_object_and_its_support_as_dense_ones_do(drill, m
 
 @pytest.mark.parametrize(("share", "worst_deg"), [(0.1, 10.0), (0.03, 30.0)])
 def test_sparse_views_are_registered_as_well_as_they_state(drill, share, worst_deg):
-    indices, sensor, squares = drill.indices[:2], Sensor(*drill.sensor()), []
+    indices, sensor, squares = drill.indices[:2], Sensor(drill.sensor()), []
     truth = true_motion(drill.truth(), *indices)
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -139,7 +139,7 @@ def test_a_small_object_is_registered_by_a_hundred_pixels(drill):
     indices, (sigma_wh, sigma_r_m, *_) = drill.indices[:2], drill.sensor()
     found = segmented([drill.frame(index) for index in indices])
     target, source = (
-        Sensor(sigma_wh, sigma_r_m).ray_image(coarse(drill.frame(index), 6), segmentation.plane)
+        Sensor(SensorNoise(sigma_wh, sigma_r_m)).ray_image(coarse(drill.frame(index), 6), segmentation.plane)
         for index, segmentation in zip(indices, found, strict=True)
     )
     density = TablePrior().between(source, target)
@@ -163,7 +163,7 @@ def coarse(frame, step):
 
 def test_sparse_frames_make_a_model(drill, rng):
     frames = [thinned(drill.frame(index), 0.1, rng) for index in drill.indices]
-    builder = Modeler(sensor=Sensor(*drill.sensor()), prior=TablePrior(), fuser=Fuser(voxel_m=0.008))
+    builder = Modeler(sensor=Sensor(drill.sensor()), prior=TablePrior(), fuser=Fuser(voxel_m=0.008))
     *_, last = (event for event in builder.run(frames, Scene()) if isinstance(event, Step))
     assert set(last.solution.trajectory) == set(drill.indices)
     assert last.model is not None

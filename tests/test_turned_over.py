@@ -38,6 +38,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    SensorNoise,
     Solution,
     Stated,
     Step,
@@ -88,7 +89,7 @@ def test_a_recipe_puts_the_object_down_otherwise_and_it_stands_on_the_table() ->
 
 def test_both_postures_make_one_model_and_the_table_ties_neither_to_the_other() -> None:
     sequence = RenderedSequence(RECIPE)
-    modeler = Modeler(prior=TablePrior(), sensor=Sensor(*sequence.sensor()), closer=Closer(max_relocations=0))
+    modeler = Modeler(prior=TablePrior(), sensor=Sensor(sequence.sensor()), closer=Closer(max_relocations=0))
     steps = [event for event in modeler.run(sequence, Scene()) if isinstance(event, Step)]
     last, truth = steps[-1], sequence.truth()
     lost = {step.frame.index for step in steps if step.left_out is not None}
@@ -105,7 +106,7 @@ def test_both_postures_make_one_model_and_the_table_ties_neither_to_the_other() 
 
 def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
     poses = tabletop.turntable(6)
-    sensor = Sensor(1e-3, 1e-3)
+    sensor = Sensor(SensorNoise(1e-3, 1e-3))
     views = {k: sensor.ray_image(view.frame) for k, view in tabletop.views(tabletop.BRICK, poses).items()}
     moved = {k + 6: shifted(view, k + 6) for k, view in views.items()}
     one, other = tabletop.trajectory(poses), {k + 6: pose for k, pose in tabletop.trajectory(poses).items()}
@@ -128,7 +129,7 @@ def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
 def test_a_rotation_that_the_alignment_alone_bounds_joins_nothing(sigma_deg: float, accepted: bool) -> None:
     """A mug whose handle is hidden: the pair would repeat whatever the alignment of the models said."""
     pose = tabletop.turntable(6)[0]
-    view = Sensor(1e-3, 1e-3).ray_image(tabletop.view(tabletop.BRICK, pose, 0).frame)
+    view = Sensor(SensorNoise(1e-3, 1e-3)).ray_image(tabletop.view(tabletop.BRICK, pose, 0).frame)
     spread = np.diag([1e-6, np.radians(sigma_deg) ** 2, *np.full(4, 1e-6)])
     found = Posterior(0, 0, PoseGaussian(np.eye(4), spread), Outcome.CONVERGED, overlap=0.9)
     judged = Joiner()._judged(found, (view, view), np.eye(4))

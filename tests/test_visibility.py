@@ -11,7 +11,7 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import bundled, open_sequence
-from modeler.types import Camera, Frame, Outcome
+from modeler.types import Camera, Frame, Outcome, SensorNoise
 from modeler.verdict.advice import outcome_advice
 from modeler.views import Sensor
 
@@ -25,7 +25,7 @@ def flashlight():
     truth, sensor = sequence.truth(), sequence.sensor()
     assert truth is not None
     assert sensor is not None
-    return frames, plane, Sensor(*sensor), true_motion(truth, target=0, source=1)
+    return frames, plane, Sensor(sensor), true_motion(truth, target=0, source=1)
 
 
 def occluded(frame, rng):
@@ -94,7 +94,7 @@ def flat_view(index, angle_rad, shift_m, sensor):
     return sensor.ray_image(Frame(index, float(index), np.where(mask, 0.6, 0.65).astype(np.float32), camera, mask))
 
 
-@pytest.mark.parametrize("sensor", [Sensor(), Sensor(0.0, 0.0)])
+@pytest.mark.parametrize("sensor", [Sensor(), Sensor(SensorNoise(0.0, 0.0))])
 def test_a_flat_object_from_above_without_noise_is_registered(sensor, rng):
     source, target = flat_view(1, np.radians(20.0), 0.01, sensor), flat_view(0, 0.0, 0.0, sensor)
     posterior = VisibilityRegistrar().register(source, target, GeneralPrior().between(source, target), rng=rng)
@@ -113,7 +113,7 @@ def test_the_choice_of_points_moves_an_answer_by_less_than_half_its_standard_dev
     assert noise is not None
     squares = []
     for first in (0, 2, 4):
-        target, source = (Sensor(*noise).ray_image(sequence.frame(index)) for index in (first, first + 1))
+        target, source = (Sensor(noise).ray_image(sequence.frame(index)) for index in (first, first + 1))
         density = GeneralPrior().between(source, target)
         found = [
             about_point(

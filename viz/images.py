@@ -15,7 +15,7 @@ from PIL import Image
 from modeler import se3
 from modeler.kernels import point_likelihood as kernel
 from modeler.registration.visibility import VisibilityLikelihood
-from modeler.types import Array, BoolArray, Frame, RayImage, Step
+from modeler.types import Array, BoolArray, Frame, RayImage, SensorNoise, Step
 from modeler.views import Sensor
 from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, Drawing, shown_posterior
@@ -209,4 +209,4 @@ def projection(source: RayImage, target: RayImage, target_from_source: Array) ->
 
 def _ready(view: RayImage) -> RayImage:
     """Return a view with the images that the likelihood looks up; steps hold earlier views without them."""
-    return view if view.layers else Sensor(view.sigma_wh, view.sigma_r_m).ray_image(view.frame, view.plane)
+    return view if view.layers else Sensor(SensorNoise(view.sigma_wh, view.sigma_r_m)).ray_image(view.frame, view.plane)

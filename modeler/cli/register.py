@@ -54,7 +54,7 @@ class Register:
                 failure = prepared.failure
                 raise InputError(f"{self.sequence}: frame {index} has {failure.label}. {outcome_advice(failure)}")
             views.append(prepared.view)
-        posterior = modeler.register(*views).widened(modeler.sensor.sigma_focal)
+        posterior = modeler.register(*views).widened(modeler.sensor.noise.sigma_focal)
         what_to_do = outcome_advice(posterior.outcome, modeler.prior, posterior)
         edge = Edge(posterior, "odometry", posterior.usable, Stated(as_options(what_to_do)))
         record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}

@@ -37,7 +37,7 @@ from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.sequences import AbstractSequence
 from modeler.sequences.hand_shapes import hand_poses
 from modeler.sequences.input_files import frame_number
-from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError
+from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError, SensorNoise
 from modeler.views import Sensor
 
 _GIVEN = {
@@ -72,7 +72,7 @@ def modeler(
     """
     check_region(where, sequence)
     noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
-    sensor = Sensor(sigma_focal=NOMINAL_FOCAL) if noise is None else Sensor(*noise)
+    sensor = Sensor(SensorNoise(sigma_focal=NOMINAL_FOCAL) if noise is None else noise)
     return Modeler(
         segmenter=segmenter(where),
         sensor=sensor,

@@ -212,7 +212,8 @@ class FocalCalibrator:
             prior: of the run.
         """
         known, root = prior.relaxed(_LIMIT_STEPS), min(views)
-        unsure = replace(sensor, sigma_focal=self.prior_sigma)  # so that registrations tell how they follow it
+        # Unsure, so that registrations tell how they follow it.
+        unsure = replace(sensor, noise=sensor.noise._replace(sigma_focal=self.prior_sigma))
         taking_part = [edge for edge in edges if {edge.source, edge.target} <= views.keys() and _counts(edge)]
 
         def estimate_at(centre: float) -> FocalLength:

@@ -416,7 +416,7 @@ class Run:
         views and edges are converted to its estimate.
         """
         state, focal = self.state.with_spans(), None
-        if (sigma := self.modeler.sensor.sigma_focal) > 0.0 and len(state.solution.trajectory) > 1:
+        if (sigma := self.modeler.sensor.noise.sigma_focal) > 0.0 and len(state.solution.trajectory) > 1:
             state, focal = self._with_focal_length(state, sigma)
         distance_sigma = self.modeler.common_distance if sigma > 0.0 else 0.0
         solved = partial(state.solved, focal=focal, distance_sigma=distance_sigma)

@@ -115,15 +115,16 @@ Typical manufacturing tolerance. Focal lengths fitted to boards are good to some
 
 
 class SensorNoise(NamedTuple):
-    """Noise of a depth camera, given by a sequence."""
+    """Noise of a depth camera in ray coordinates (paper, section II); the defaults are the first Kinect's."""
 
     sigma_wh: float = 0.002
-    """Lateral noise in ray coordinates (w, h); the paper's value for the first Kinect."""
+    """Lateral noise in (w, h)."""
     sigma_r_m: float = 0.002
     """Noise along the ray in m, for a surface that faces the camera."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
-    """Standard deviation in px of the shift of colours against depth from one image to the next."""
-    sigma_focal: float = NOMINAL_FOCAL
+    """Shift of colours beside depth from one image to the next, in px: they are aligned so well at best, and may be
+    taken at another moment."""
+    sigma_focal: float = 0.0
     """Standard deviation of the logarithm of the focal length; 0 = it is exact."""
 
 

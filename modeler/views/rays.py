@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from modeler.kernels import planes
-from modeler.types import COLOUR_SHIFT_PX, BoolArray, Frame, Plane, RayImage, SensorNoise
+from modeler.types import BoolArray, Frame, Plane, RayImage, SensorNoise
 from modeler.views.range_noise import RangeNoise
 from modeler.views.sparsity import ON_PLANE, closed, gap_px, measured_share, nearest_depth
 
@@ -19,21 +19,14 @@ _RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen
 
 @dataclass(frozen=True)
 class Sensor:
-    """Noise of the depth camera in ray coordinates (paper, section II), and how its images are smoothed."""
+    """A depth camera: its noise, how errors of pixels are alike, and how its images are smoothed."""
 
-    sigma_wh: float = _KINECT.sigma_wh
-    """Lateral noise in (w, h); the paper's value for the first Kinect."""
-    sigma_r_m: float = _KINECT.sigma_r_m
-    """Noise along the ray in m, for a surface that faces the camera."""
-    sigma_colour_px: float = COLOUR_SHIFT_PX
-    """Shift of colours beside depth from one image to the next, in px: they are aligned so well at best, and may be
-    taken at another moment."""
-    sigma_focal: float = 0.0
-    """Standard deviation of the logarithm of the focal length; 0 = it is taken for known."""
+    noise: SensorNoise = _KINECT
+    """Noise that the camera's makers state or a calibration has measured."""
     smoothing: float = 0.24
     """Radius of the ball in which planes are fitted, as a share of the geometric mean of noise and object's extent.
 
-    The noise is `sigma_r_m`, or that of pixels of planes around the object if it is less.
+    The noise is that along the ray, or that of pixels of planes around the object if it is less.
 
     Smoothing over a ball of radius r displaces a surface whose radius of curvature is about the extent by r² / extent,
     away from the camera, so that the image of a turning object lags behind it. With this radius the displacement is the
@@ -135,10 +128,10 @@ class Sensor:
         return RayImage(
             frame=frame,
             plane=plane,
-            sigma_wh=self.sigma_wh,
-            sigma_r_m=self.sigma_r_m,
-            sigma_colour_px=self.sigma_colour_px,
-            sigma_focal=self.sigma_focal,
+            sigma_wh=self.noise.sigma_wh,
+            sigma_r_m=self.noise.sigma_r_m,
+            sigma_colour_px=self.noise.sigma_colour_px,
+            sigma_focal=self.noise.sigma_focal,
             points_m=points_m,
             normals=normals,
             pixels=pixels,
@@ -174,8 +167,8 @@ class Sensor:
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
         # method, eq. 1.1; no more noise than stated, as unevenness of planes adds to theirs
         known = math.isfinite(self.pixel_sigma_inverse_per_m)
-        pixel_m = self.pixel_sigma_inverse_per_m * middle_m**2 if known else self.sigma_r_m
-        noise_m = min(pixel_m, self.sigma_r_m)
+        pixel_m = self.pixel_sigma_inverse_per_m * middle_m**2 if known else self.noise.sigma_r_m
+        noise_m = min(pixel_m, self.noise.sigma_r_m)
         radius_m = max(self.smoothing * np.sqrt(noise_m * extent_m), sparse_px * metres_per_px)
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, max(16, np.ceil(1.2 * sparse_px))))
         # A stride of 2 px is enough where a wide window holds many pixels.
@@ -185,7 +178,7 @@ class Sensor:
         ball_px = np.pi * (radius_m / metres_per_px) ** 2
         sharing = max(density * (ball_px + _ALIKE * self.noise_area_px), 1.0)
         # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
-        return ball, 0.1 * self.sigma_r_m / middle_m**2, (float(sharing), float(ball_px + self.noise_area_px))
+        return ball, 0.1 * self.noise.sigma_r_m / middle_m**2, (float(sharing), float(ball_px + self.noise_area_px))
 
 
 def rim_weights(outline: BoolArray) -> np.ndarray:

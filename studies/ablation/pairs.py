@@ -145,7 +145,7 @@ def recorded_views(name: str) -> dict[int, RayImage]:
     sequence, segmenter, views = open_sequence(SHARED / name), Segmenter(), {}
     noise = sequence.sensor()
     scene = segmenter.scene([sequence.frame(index) for index in scene_frames(sequence.indices)])
-    sensor = (Sensor() if noise is None else Sensor(*noise)).measured(scene.range_noise)
+    sensor = (Sensor() if noise is None else Sensor(noise)).measured(scene.range_noise)
     for index in sequence.indices:
         found = segmenter.segment(sequence.frame(index), scene)
         if found.outcome in (Outcome.CONVERGED, Outcome.UNSURE_MASK):

@@ -71,7 +71,7 @@ def demonstrate(recipe: Recipe, folder: RunFolder, stream: RerunStream, goal: Go
     began_s, rng, robot = time.perf_counter(), np.random.default_rng([recipe.seed, 1]), SimulatedRobot.before(recipe)
     sequence, reached = robot.stage.sequence, False
     prior = TablePrior(max_rotation_deg=REACH_DEG)
-    modeler = Modeler(sensor=Sensor(*sequence.sensor()), prior=prior, seed=recipe.seed)
+    modeler = Modeler(sensor=Sensor(sequence.sensor()), prior=prior, seed=recipe.seed)
     settings = {"max_rotation_deg": REACH_DEG}
     meta = RunMeta(str(folder.path.parent / "scene"), recipe.seed, "table", settings=settings)
     run = modeler.start(modeler.segmenter.scene([robot.stage.frame()]))

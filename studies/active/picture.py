@@ -32,7 +32,7 @@ def main() -> None:
     options = parser.parse_args()
     recipe = load_recipe(options.shape)
     robot, rng = SimulatedRobot.before(recipe), np.random.default_rng([recipe.seed, 1])
-    modeler = Modeler(sensor=Sensor(*robot.stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=100.0))
+    modeler = Modeler(sensor=Sensor(robot.stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=100.0))
     run = modeler.start(modeler.segmenter.scene([robot.stage.frame()]))
     shown: list[tuple[Belief, str]] = []
     for _ in range(options.actions + 1):

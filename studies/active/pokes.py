@@ -35,7 +35,7 @@ def main() -> None:
 def row(name: str) -> str:
     """Return the first poke at a shape, and a turn by the same unmeasured angle."""
     robot, rng = SimulatedRobot.before(small(load_specimen(name), 0, 320)), np.random.default_rng(0)
-    table = Modeler(sensor=Sensor(*robot.stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
+    table = Modeler(sensor=Sensor(robot.stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
     scene = table.segmenter.scene([robot.stage.frame()])
     step = shown(table.start(scene), robot.stage)
     belief = table.belief(step.views, step.solution, step.edges_so_far)

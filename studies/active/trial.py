@@ -110,7 +110,7 @@ def visible_points(shape: str, seed: int, width_px: int) -> Array:
         turned = Stage(stage.recipe, (stage.poses[0],)).moved_on_table(15.0 * step, (0.0, 0.0))
         exact = replace(turned.recipe, sensor=None)
         sequence = Stage(exact, turned.poses).sequence
-        view = Sensor(*sequence.sensor()).ray_image(sequence.frame(1))
+        view = Sensor(sequence.sensor()).ray_image(sequence.frame(1))
         points.append(se3.transform(se3.inverse(sequence.truth()[1]), view.points_m))
     return thinned(np.concatenate(points))
 
@@ -137,7 +137,7 @@ class Trial:
         recipe = small(load_specimen(self.shape), self.seed, self.width_px)
         rng = np.random.default_rng([self.seed, zlib.crc32(self.shape.encode()), len(self.policy)])
         stage = Stage(recipe)
-        modeler = Modeler(sensor=Sensor(*stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
+        modeler = Modeler(sensor=Sensor(stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
         wanted = KDTree(visible_points(self.shape, self.seed, self.width_px))
         covered = np.zeros(wanted.n, dtype=bool)
         scene = modeler.segmenter.scene([stage.frame()])

@@ -19,7 +19,7 @@ import numpy as np
 from modeler.baselines import PaperRegistrar
 from modeler.kernels import gpu
 from modeler.sequences import bundled, open_sequence
-from modeler.types import RayImage
+from modeler.types import RayImage, SensorNoise
 from modeler.views import Sensor
 from studies.bench import speed
 
@@ -65,7 +65,7 @@ def _samples(device: gpu.Device, samples: int, views: list[RayImage], timed: Tim
 def _views(name: str, most: int) -> list[RayImage]:
     """Return the first views, at most so many, of a bundled sequence, prepared."""
     sequence = open_sequence(bundled(name))
-    sensor = Sensor(*(sequence.sensor() or ()))
+    sensor = Sensor(sequence.sensor() or SensorNoise())
     return [sensor.ray_image(frame, plane) for frame, plane in speed.segmented(sequence, most)]
 
 

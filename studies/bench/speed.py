@@ -18,7 +18,7 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import AbstractSequence, bundled, open_sequence
-from modeler.types import AbstractPrior, Array, Frame, Plane, RayImage
+from modeler.types import AbstractPrior, Array, Frame, Plane, RayImage, SensorNoise
 from modeler.views import Sensor
 from studies.bench import reference
 
@@ -93,7 +93,7 @@ def timings(pairs: int | None) -> Iterator[Timing]:
     """
     for name in SEQUENCES:
         sequence = open_sequence(bundled(name))
-        frames, sensor = segmented(sequence), Sensor(*(sequence.sensor() or ()))
+        frames, sensor = segmented(sequence), Sensor(sequence.sensor() or SensorNoise())
         truth = sequence.truth()
         assert truth is not None
         table = methods(sensor)
@@ -134,7 +134,7 @@ def timings(pairs: int | None) -> Iterator[Timing]:
 def paper_seconds() -> float:
     """Return the seconds that the paper's brute force takes for 10⁸ samples of the general prior, by its rate."""
     sequence = open_sequence(bundled("box"))
-    frames, sensor = segmented(sequence), Sensor(*(sequence.sensor() or ()))
+    frames, sensor = segmented(sequence), Sensor(sequence.sensor() or SensorNoise())
     source, target = (sensor.ray_image(*frames[k]) for k in (1, 0))
     density = PRIORS["general"].between(source, target)
     samples = 100_000

@@ -201,7 +201,7 @@ def rendered_views(sequence: RenderedSequence) -> dict[int, RayImage]:
     frames = {index: sequence.frame(index) for index in sequence.indices}
     scene = segmenter.scene([frames[index] for index in scene_frames(sequence.indices)])
     # By two frames, so that what is made of a pair does not depend on how many there are.
-    sensor = Sensor(*sequence.sensor()).measured(segmenter.scene([frames[k] for k in sequence.indices[:2]]).range_noise)
+    sensor = Sensor(sequence.sensor()).measured(segmenter.scene([frames[k] for k in sequence.indices[:2]]).range_noise)
     return {index: sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for index, frame in frames.items()}
 
 

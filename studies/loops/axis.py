@@ -48,7 +48,7 @@ def run(sequence: AbstractSequence, seed: int) -> Step:
     """Build a sequence and return the last step."""
     noise = sequence.sensor()
     maker = Modeler(
-        sensor=Sensor() if noise is None else Sensor(*noise),
+        sensor=Sensor() if noise is None else Sensor(noise),
         prior=TurntablePrior(_STEP_DEG, _SIGMA_DEG),
         fuser=Fuser(voxel_m=0.01),
         seed=seed,

@@ -76,7 +76,7 @@ def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, 
     registrar = VisibilityRegistrar() if truth is None else Known(truth)
     return Modeler(
         segmenter=Segmenter(),
-        sensor=Sensor() if noise is None else Sensor(*noise),
+        sensor=Sensor() if noise is None else Sensor(noise),
         prior=TablePrior() if case.prior == "table" else GeneralPrior(),
         registrar=Lying(registrar, lies) if lies else registrar,
         closer=closer,

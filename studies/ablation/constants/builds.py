@@ -11,7 +11,7 @@ from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior, TurntablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene
-from modeler.types import NOMINAL_FOCAL, Solution, Step
+from modeler.types import NOMINAL_FOCAL, SensorNoise, Solution, Step
 from modeler.views import Sensor
 from studies.ablation.constants.inputs import Figures, Footage, GivenMasks, Recalling, digest
 
@@ -31,7 +31,7 @@ def run(footage: Footage) -> Step:
     found = {frame.index: one for frame, one in zip(footage.frames, footage.found, strict=True)}
     modeler = Modeler(
         segmenter=GivenMasks(found),  # pyright: ignore[reportArgumentType]
-        sensor=Sensor() if footage.is_focal_exact else Sensor(sigma_focal=NOMINAL_FOCAL),
+        sensor=Sensor() if footage.is_focal_exact else Sensor(SensorNoise(sigma_focal=NOMINAL_FOCAL)),
         prior=AutoPrior() if footage.step_deg is None else TurntablePrior(footage.step_deg, axis_sigma_deg=30.0),
         registrar=Recalling(VisibilityRegistrar()),
         fuser=Fuser(max_voxels=24**3),
