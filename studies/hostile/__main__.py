@@ -178,7 +178,8 @@ def outcome(trial: Trial, command: tuple[str, ...]) -> str:
             stderr=said,
             start_new_session=True,
         )
-        fault, allowed = "", set(_ENDED)
+        allowed: set[int] = {*_ENDED}
+        fault = ""
         try:
             if trial.signalled is not None:
                 number, after_s = trial.signalled
@@ -221,7 +222,7 @@ def main() -> int:
     out = options.out.absolute()
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    compile_kernels()
+    compile_kernels(print)
     root = str(Path(cache.__file__).parents[2])
     environment = {**os.environ, "PYTHONPATH": root}
     built = [sys.executable, "-m", "modeler", "build", _BOX, "--out", str(out / "run"), *_FEW]
