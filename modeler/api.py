@@ -56,7 +56,7 @@ def register(
     target_depth_m: npt.ArrayLike,
     intrinsics: Intrinsics,
     *,
-    prior: AbstractPrior | None = None,
+    prior: AbstractPrior | str | None = None,
     masks: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
     colours: tuple[np.ndarray, np.ndarray] | None = None,
     sensor: Sensor | None = None,
@@ -68,8 +68,9 @@ def register(
         source_depth_m: (h, w) depth in m; 0 or NaN where nothing was measured.
         target_depth_m: (h, w), of the same camera.
         intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
-        prior: of the motion; None: `AutoPrior`, free motion or motion on the table if one is seen, with rotations up to
-            50° and shifts of up to 4 cm, then any if none of these matches or the images contradict the match.
+        prior: of the motion, or its name as in `--prior`; None: `AutoPrior`, free motion or motion on the table if one
+            is seen, with rotations up to 50° and shifts of up to 4 cm, then any if none of these matches or the images
+            contradict the match.
         masks: (h, w) of source and target, true on the object; None: the object is segmented.
         colours: (h, w, 3) 8-bit RGB of source and target, aligned to depth; None: only depth is compared.
         sensor: noise of the camera; None: the first Kinect's.
@@ -78,13 +79,16 @@ def register(
     Raises:
         InputError: if an image cannot be used, shows no object, or lacks what the prior needs.
     """
-    pictures = [np.array(depth, dtype=np.float32) for depth in (source_depth_m, target_depth_m)]
-    if pictures[0].ndim != 2 or pictures[0].shape != pictures[1].shape:
+    pictures = [_numbers("depth image", depth).astype(np.float32) for depth in (source_depth_m, target_depth_m)]
+    if pictures[0].ndim != 2 or pictures[0].shape != pictures[1].shape or not pictures[0].size:
         shapes = " and ".join(str(picture.shape) for picture in pictures)
         raise InputError(f"the depth images have shapes {shapes}; give two arrays (h, w) of the same camera")
-    given = [None, None] if masks is None else [np.asarray(mask, dtype=bool) for mask in masks]
-    if any(mask is not None and mask.shape != pictures[0].shape for mask in given):
-        raise InputError(f"the masks have another shape than the depth images, {pictures[0].shape}; give the same")
+    for name, images in (("masks", masks), ("colours", colours)):
+        if images is not None and len(images) != len(pictures):
+            raise InputError(f"there are {len(images)} {name} for two depth images; give one for each")
+    given = [None, None] if masks is None else [_numbers("mask", mask) for mask in masks]
+    if any(mask is not None and (mask.shape != pictures[0].shape or np.isnan(mask).any()) for mask in given):
+        raise InputError(f"the masks hold NaN, or have another shape than depth's {pictures[0].shape}; correct them")
     rgb = [None, None] if colours is None else [np.asarray(colour) for colour in colours]
     for colour in rgb:
         if colour is not None and (colour.shape != (*pictures[0].shape, 3) or colour.dtype != np.uint8):
@@ -95,7 +99,9 @@ def register(
     frames = []
     for index, (depth_m, mask, colour) in enumerate(zip(pictures, given, rgb, strict=True)):
         depth_m[~(depth_m > 0.0) | np.isinf(depth_m)] = np.nan
-        frames.append(Frame(index, float(index), depth_m, camera, mask=mask, colour=colour))
+        frames.append(
+            Frame(index, float(index), depth_m, camera, mask=None if mask is None else mask != 0, colour=colour)
+        )
     registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colours is not None))
     modeler = Modeler(sensor=sensor or Sensor(), prior=AutoPrior(), registrar=registrar, seed=seed)
     scene = modeler.segmenter.scene(frames)
@@ -105,7 +111,8 @@ def register(
         if prepared.view is None:
             raise InputError(f"the {name} image has {prepared.failure.label}: {prepared.failure.advice}")
         views.append(prepared.view)
-    return modeler.register(*views, prior=prior)
+    known = compose.chosen_prior(PriorOptions(prior=prior), None) if isinstance(prior, str) else prior
+    return modeler.register(*views, prior=known)
 
 
 def build(
@@ -164,6 +171,21 @@ def build(
     return Result(last.model, last.solution, last.verdict, report, folder.path)
 
 
+def _numbers(name: str, image: npt.ArrayLike) -> np.ndarray:
+    """Return an image as an array of its own.
+
+    Raises:
+        InputError: if it is none of real numbers.
+    """
+    try:
+        array = np.array(image)
+    except ValueError as error:  # rows of different lengths
+        raise InputError(f"a {name} is no array ({error}); give one of numbers") from None
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"a {name} is of {array.dtype}; give real numbers")
+    return array
+
+
 def _camera(intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
     """Return the camera of images of a shape (h, w).
 
@@ -173,7 +195,7 @@ def _camera(intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
     height, width = shape
     if isinstance(intrinsics, Camera):
         return intrinsics
-    numbers = np.asarray(intrinsics, dtype=np.float64)
+    numbers = _numbers("camera", intrinsics).astype(np.float64)
     if numbers.shape == (3, 3):
         numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
     if numbers.shape != (4,) or not np.isfinite(numbers).all() or not (numbers[:2] > 0.0).all():

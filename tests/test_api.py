@@ -6,7 +6,9 @@ import os
 import pydoc
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,10 @@ import tabletop
 
 import modeler
 from modeler import se3
+from modeler.composition.compose import chosen_prior
+from modeler.composition.options import PriorOptions
 from modeler.sequences import bundled
+from modeler.types import Camera
 
 POSES = tabletop.turntable(15)
 SOURCE, TARGET = (tabletop.view(tabletop.Box((0.06, 0.045, 0.08)), POSES[index], index).frame for index in (1, 0))
@@ -103,6 +108,39 @@ def test_two_depth_images_give_a_pose_and_its_covariance() -> None:
     np.testing.assert_array_equal(one.pose.mean, other.pose.mean)
 
 
+def test_a_prior_may_be_named() -> None:
+    arguments = {"masks": (SOURCE.mask, TARGET.mask)}
+    one, other = (
+        modeler.register(SOURCE.depth_m, TARGET.depth_m, NUMBERS, prior=prior, **arguments)  # pyright: ignore
+        for prior in ("table", chosen_prior(PriorOptions(prior="table"), None))
+    )
+    np.testing.assert_array_equal(one.pose.mean, other.pose.mean)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"depth_m": SOURCE.depth_m[:10]},
+        {"depth_m": SOURCE.depth_m.astype(np.uint16)},
+        {"mask": np.ones((3, 4), dtype=bool)},
+        {"mask": np.ones(SOURCE.depth_m.shape)},
+        {"colour": np.zeros(SOURCE.depth_m.shape, dtype=np.uint8)},
+        {"occluder": np.ones((4, 3), dtype=bool)},
+        {"camera": replace(CAMERA, width=2 * CAMERA.width)},
+    ],
+)
+def test_no_frame_has_images_of_another_camera(change: dict[str, Any]) -> None:
+    """What a kernel reads lies in the images that it is given."""
+    with pytest.raises(modeler.InputError, match="where its camera has"):
+        replace(SOURCE, **change)
+
+
+@pytest.mark.parametrize("change", [{"width": 0}, {"fx": 0.0}, {"fy": -5.0}, {"cx": np.nan}, {"fx": np.inf}])
+def test_no_camera_is_without_pixels_or_focal_length(change: dict[str, Any]) -> None:
+    with pytest.raises(modeler.InputError):
+        replace(CAMERA, **change)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -111,6 +149,19 @@ def test_two_depth_images_give_a_pose_and_its_covariance() -> None:
         ({"intrinsics": (0.0, 500.0, 10.0, 10.0)}, "intrinsics"),
         ({"masks": (np.ones((3, 4)), np.ones((3, 4)))}, "masks"),
         ({"source_depth_m": np.zeros_like(SOURCE.depth_m)}, "source image"),
+        ({"source_depth_m": np.zeros((0, 0)), "target_depth_m": np.zeros((0, 0))}, "have shapes"),
+        ({"source_depth_m": [[1.0], [1.0, 2.0]]}, "is no array"),
+        ({"source_depth_m": SOURCE.depth_m.astype(complex)}, "complex"),
+        ({"intrinsics": Camera(64, 48, *NUMBERS)}, "its camera has"),
+        ({"intrinsics": Camera(6400, 4800, *NUMBERS)}, "its camera has"),
+        ({"masks": (SOURCE.mask,)}, "1 masks for two"),
+        ({"masks": (np.full(SOURCE.depth_m.shape, np.nan), TARGET.mask)}, "NaN"),
+        ({"masks": ("mask", "mask")}, "real numbers"),
+        ({"colours": (np.zeros((*SOURCE.depth_m.shape, 4), np.uint8),) * 2}, "colours"),
+        ({"colours": (SOURCE.colour,)}, "1 colours for two"),
+        ({"seed": -1}, "negative"),
+        ({"prior": "tabel"}, "unknown prior"),
+        ({"prior": "held"}, "held"),
     ],
 )
 def test_what_cannot_be_registered_is_refused(change: dict[str, object], words: str) -> None:

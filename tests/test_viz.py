@@ -159,7 +159,8 @@ def test_a_frame_without_colour_has_none_in_the_recording(tmp_path: Path) -> Non
 
 def test_large_images_are_shown_smaller(run: list[Step]) -> None:
     depth_m = np.ones((960, 1280), dtype=np.float32)
-    frame = replace(run[0].frame, depth_m=depth_m, colour=None)
+    camera = replace(run[0].frame.camera, width=1280, height=960)
+    frame = replace(run[0].frame, depth_m=depth_m, camera=camera, mask=None, colour=None)
     step = replace(run[0], frame=frame, segmentation=replace(run[0].segmentation, mask=depth_m > 0.0))
     (depth,) = [archetype for path, archetype in images.draw_frame(step) if path == entities.DEPTH]
     assert isinstance(depth, rr.EncodedDepthImage)
@@ -177,7 +178,9 @@ def test_the_depth_view_opens_around_the_object_at_any_size(run: list[Step]) -> 
     view = run[0].view
     assert view is not None
     depth_m = np.kron(view.frame.depth_m, np.ones((10, 10), dtype=np.float32))
-    large = replace(view, frame=replace(view.frame, depth_m=depth_m), pixels=10 * view.pixels)
+    camera = replace(view.frame.camera, width=depth_m.shape[1], height=depth_m.shape[0])
+    frame = replace(view.frame, depth_m=depth_m, camera=camera, mask=None, colour=None)
+    large = replace(view, frame=frame, pixels=10 * view.pixels)
     for shown, shrunk in ((view, 1), (large, 3)):
         bounds = blueprint.around(shown).range
         assert bounds is not None

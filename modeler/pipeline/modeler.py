@@ -33,6 +33,7 @@ from modeler.types import (
     Frame,
     FrameRecord,
     Fusing,
+    InputError,
     NotJoined,
     Posterior,
     RayImage,
@@ -86,6 +87,15 @@ class Modeler:
     """Each pair has its own random generator, seeded with this and the two frame numbers."""
     cache: AbstractPairCache | None = None
     """Registrations of an interrupted run, if any."""
+
+    def __post_init__(self) -> None:
+        """Reject a seed that random generators do not take.
+
+        Raises:
+            InputError: if it is negative.
+        """
+        if self.seed < 0:
+            raise InputError(f"the seed {self.seed} is negative; give a whole number from 0")
 
     def run(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -12,6 +12,8 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.types.base import Array, BoolArray, InputError, Outcome
+
+_KINDS = {"f": "floating-point numbers", "b1": "bool", "u1": "8-bit integers"}
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,15 @@ class Camera:
     """Column of the principal point in px; pixel centres lie at whole numbers."""
     cy: float
     """Row of the principal point in px."""
+
+    def __post_init__(self) -> None:
+        """Reject a camera that has no pixels or no focal length.
+
+        Raises:
+            InputError: if it has none.
+        """
+        if not (self.width > 0 < self.height and self.fx > 0.0 < self.fy and np.isfinite(astuple(self)).all()):
+            raise InputError(f"{self} is none; give a size in px, positive focal lengths and a principal point")
 
     def rays(self) -> tuple[Array, Array]:
         """Return w = x/z and h = y/z of every pixel, each (h, w)."""
@@ -56,6 +67,25 @@ class Frame:
     """(h, w, 3) RGB aligned to depth."""
     occluder: BoolArray | None = None
     """(h, w) True where a hand or a gripper is marked, which may hide the object; None = none is."""
+
+    def __post_init__(self) -> None:
+        """Reject images of other shapes or types than the fields say: compiled functions read them unchecked.
+
+        Raises:
+            InputError: if an image is another.
+        """
+        shape = (self.camera.height, self.camera.width)
+        for name, image, expected, kind in (
+            ("depth", self.depth_m, shape, "f"),
+            ("mask", self.mask, shape, "b1"),
+            ("colour", self.colour, (*shape, 3), "u1"),
+            ("occluder", self.occluder, shape, "b1"),
+        ):
+            if image is not None and not (image.shape == expected and image.dtype.str[1:].startswith(kind)):
+                raise InputError(
+                    f"frame {self.index}: {name} has shape {image.shape} of {image.dtype}, where its camera has "
+                    f"{expected} of {_KINDS[kind]}; correct one of them"
+                )
 
     @property
     def unoccluded(self) -> Frame:
