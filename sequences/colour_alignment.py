@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, final
+from typing import Final, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,19 +20,27 @@ _EDGE: Final = 0.03  # relative second difference of inverse depth, which is lin
 _LEAST_EDGES: Final = 12.0  # px at that size, mean over the frames
 
 
+Flip = Literal["", "mirrored", "upside down"]
+_FLIPS: Final[dict[Flip, tuple[slice, slice]]] = {
+    "": (slice(None), slice(None)),
+    "mirrored": (slice(None), slice(None, None, -1)),
+    "upside down": (slice(None, None, -1), slice(None, None, -1)),
+}
+
+
 @final
 @dataclass(frozen=True)
 class Misalignment:
     """Where edges of depth are found in colour, if not where they are."""
 
-    mirrored: bool
-    """Whether colour is mirrored left to right."""
+    flip: Flip
+    """Whether colour is mirrored left to right, or upside down."""
     scale: tuple[float, float]
     """Size of things in colour relative to depth, across and down."""
     shift_px: tuple[float, float]
     """Shift of colour against depth at the middle of the image, right and down, in px of the images."""
     support: float
-    """Correlation of edges there, in standard deviations over all shifts."""
+    """Largest correlation of edges anywhere, in standard deviations over all shifts."""
     support_aligned: float
     """Correlation of edges if colour is aligned, in standard deviations over all shifts."""
 
@@ -43,7 +51,7 @@ class Misalignment:
 
     def __str__(self) -> str:
         across, down = self.scale
-        parts = ["is mirrored"] * self.mirrored
+        parts = [f"is {self.flip}"] if self.flip else []
         if max(abs(np.log(self.scale))) > 0.02:
             size = f"{across:.2f}" if across == down else f"{across:.2f} across and {down:.2f} down"
             parts.append(f"shows things {size} times as large")
@@ -52,9 +60,10 @@ class Misalignment:
         return " and ".join(parts)
 
 
-_PLAIN, _NO_BETTER = 4.5, 3.0  # standard deviations
+_PLAIN, _NO_BETTER = 4.5, 4.0  # standard deviations; aligned captures of cameras have 5 to 15
+_STRONG, _CLEAR = 1.0, 7.0  # least correlation, or standard deviations: noise has edges everywhere
 _HIDDEN: Final = 4.5  # standard deviations above which alignment is not doubted but for a shift
-_BETTER: Final = 2.0  # ratio of correlations from which another place than alignment is believed
+_BETTER: Final = 1.5  # ratio of correlations from which another place than alignment is believed
 _SHIFTED: Final = 1.3  # the same where alignment is not plainly wrong
 _SIMPLER: Final = 0.8  # share of the best correlation with which a simpler explanation does
 _LEAST_SHIFT: Final = 2  # px at that size
@@ -69,58 +78,55 @@ def misalignment(frames: Sequence[Frame]) -> Misalignment | None:
     pairs = [_edges(frame, frame.colour) for frame in frames if frame.colour is not None]
     if not pairs or np.mean([depth.sum() for depth, _ in pairs]) < _LEAST_EDGES:
         return None
-    still = _Search(pairs).correlation(mirrored=False, scale=(1.0, 1.0))
+    still = _Search(pairs).correlation("", (1.0, 1.0))
     deviation, centre = float(still.std()), still.shape[0] // 2
     if deviation == 0.0:
         return None
     aligned = float(still[centre - 1 : centre + 2, centre - 1 : centre + 2].max())
-    shifted = _best(still, mirrored=False, scale=(1.0, 1.0))
+    shifted = _best(still, "", (1.0, 1.0))
     if aligned > _HIDDEN * deviation:
         plain = shifted.height > _SHIFTED * aligned and max(map(abs, shifted.shift)) > _LEAST_SHIFT
-        return _result(frames[0], shifted, aligned / deviation) if plain else None
+        return _result(frames[0], shifted, shifted, aligned / deviation) if plain else None
     search = _Search(pairs)
-    tried = [
-        _best(search.correlation(mirrored=mirrored, scale=scale), mirrored=mirrored, scale=scale)
-        for mirrored in (False, True)
-        for scale in _scales()
-    ]
+    tried = [_best(search.correlation(flip, scale), flip, scale) for flip in _FLIPS for scale in _scales()]
     best = max(tried, key=lambda each: each.height)
-    if best.height < _BETTER * aligned or best.height < _PLAIN * best.deviation:
+    plain = best.height > _BETTER * aligned and best.height > _PLAIN * best.deviation
+    if not plain or (best.height < _STRONG and best.height < _CLEAR * best.deviation):
         return None
     simple = sorted((each for each in tried if each.height >= _SIMPLER * best.height), key=lambda each: each.steps)
     chosen = max((each for each in simple if each.steps == simple[0].steps), key=lambda each: each.height)
-    return _result(frames[0], chosen, aligned / deviation)
+    return _result(frames[0], chosen, best, aligned / deviation)
 
 
 @final
 @dataclass(frozen=True)
 class _Peak:
-    """The best shift of one mirroring and scale."""
+    """The best shift of one flip and scale."""
 
     height: float
     deviation: float
     shift: tuple[int, int]
-    mirrored: bool
+    flip: Flip
     scale: tuple[float, float]
 
     @property
     def steps(self) -> int:
         """How complicated an explanation it is."""
         across, down = self.scale
-        return self.mirrored + (self.scale != (1.0, 1.0)) + (across != down)
+        return (self.flip != "") + (self.scale != (1.0, 1.0)) + (across != down)
 
 
-def _best(correlation: Array, *, mirrored: bool, scale: tuple[float, float]) -> _Peak:
+def _best(correlation: Array, flip: Flip, scale: tuple[float, float]) -> _Peak:
     reach = correlation.shape[0] // 2
     row, column = np.unravel_index(int(correlation.argmax()), correlation.shape)
     shift = int(column) - reach, int(row) - reach
-    return _Peak(float(correlation.max()), float(correlation.std()), shift, mirrored, scale)
+    return _Peak(float(correlation.max()), float(correlation.std()), shift, flip, scale)
 
 
-def _result(frame: Frame, peak: _Peak, aligned: float) -> Misalignment:
+def _result(frame: Frame, peak: _Peak, best: _Peak, aligned: float) -> Misalignment:
     step = _step(frame.depth_m.shape[1])
     shift_px = float(step * peak.shift[0]), float(step * peak.shift[1])
-    return Misalignment(peak.mirrored, peak.scale, shift_px, peak.height / peak.deviation, aligned)
+    return Misalignment(peak.flip, peak.scale, shift_px, best.height / best.deviation, aligned)
 
 
 def _scales() -> Iterator[tuple[float, float]]:
@@ -174,11 +180,11 @@ class _Search:
         self._colour = [np.fft.rfft2(colour, self._size) for _, colour in pairs]
         self._norm = float(np.sqrt(np.mean([np.mean(colour**2) for _, colour in pairs]))) + 1e-12
 
-    def correlation(self, *, mirrored: bool, scale: tuple[float, float]) -> Array:
+    def correlation(self, flip: Flip, scale: tuple[float, float]) -> Array:
         """Return the correlation by shift, down and right, from minus to plus the reach."""
         total, count = np.zeros(self._size), 1.0
         for depth, colour in zip(self._depth, self._colour, strict=True):
-            flipped = depth[:, ::-1] if mirrored else depth
+            flipped = depth[_FLIPS[flip]]
             moved = flipped if scale == (1.0, 1.0) else self._resized(flipped, scale)
             total += np.fft.irfft2(np.conj(np.fft.rfft2(moved, self._size)) * colour, self._size)
             count += float(moved.sum())

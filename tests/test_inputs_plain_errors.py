@@ -30,7 +30,12 @@ def colour_as(colour: np.ndarray, *, mirrored: bool, scale: float, shift_px: tup
 
 
 def cards(
-    folder: Path, *, mirrored: bool = False, scale: float = 1.0, shift_px: tuple[float, float] = (0.0, 0.0)
+    folder: Path,
+    *,
+    mirrored: bool = False,
+    upside_down: bool = False,
+    scale: float = 1.0,
+    shift_px: tuple[float, float] = (0.0, 0.0),
 ) -> Survey:
     """Return the survey of cards of one colour each before a wall, other ones in every frame."""
     rng, frames = np.random.default_rng(3), []
@@ -41,6 +46,7 @@ def cards(
             row, column, height, width = rng.integers((20, 20, 20, 20), (180, 250, 60, 70))
             depth_m[row : row + height, column : column + width] = rng.uniform(0.7, 1.2)
             colour[row : row + height, column : column + width] = rng.integers(0, 256, 3)
+        colour = colour[::-1, ::-1] if upside_down else colour
         seen = colour_as(colour, mirrored=mirrored, scale=scale, shift_px=shift_px)
         frames.append(Frame(index, float(index), depth_m, CAMERA, None, seen))
     write_bop(folder, frames)
@@ -54,14 +60,14 @@ def test_aligned_colour_is_believed(tmp_path: Path) -> None:
 def test_mirrored_colour_is_told(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", mirrored=True)
     assert found.misaligned is not None
-    assert found.misaligned.mirrored
+    assert found.misaligned.flip == "mirrored"
     assert found.doubts[0].startswith("colour is mirrored")
 
 
 def test_shifted_colour_is_told_by_how_much(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", shift_px=(20.0, -12.0))
     assert found.misaligned is not None
-    assert not found.misaligned.mirrored
+    assert not found.misaligned.flip
     assert found.misaligned.scale == (1.0, 1.0)
     assert found.misaligned.shift_px == pytest.approx((20.0, -12.0), abs=2.0)
     with pytest.raises(InputError, match="colour is shifted by about"):
@@ -145,3 +151,23 @@ def test_images_packed_by_rvl_are_read(frames: list[Frame], rng: np.random.Gener
                 from_rvl(data[: 8 + (len(data) - 8) // 8 * 4], "bag")
     with pytest.raises(InputError, match="has 0 x 0 pixels"):
         from_rvl(b"", "bag")
+
+
+def test_colour_upside_down_is_told(tmp_path: Path) -> None:
+    found = cards(tmp_path / "s", upside_down=True)
+    assert found.misaligned is not None
+    assert found.misaligned.flip == "upside down"
+    assert found.misaligned.is_sure
+
+
+def test_colour_without_anything_to_see_is_no_error(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Noise has edges everywhere, and one colour has none."""
+    for name, noise in (("plain", 0.0), ("noisy", 20.0)):
+        frames = []
+        for index in range(6):
+            depth_m = np.full((240, 320), 1.5, np.float32)
+            depth_m[60 + index : 160, 100 : 200 - 3 * index] = 1.0
+            colour = np.clip(90.0 + noise * rng.normal(size=(240, 320, 3)), 0, 255).astype(np.uint8)
+            frames.append(Frame(index, float(index), depth_m, CAMERA, None, colour))
+        write_bop(tmp_path / name, frames)
+        assert not survey(open_sequence(tmp_path / name)).plain_errors
