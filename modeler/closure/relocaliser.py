@@ -42,7 +42,7 @@ class Relocaliser:
     """Test of registrations against each other."""
     max_angle_deg: float
     """Largest rotation in degrees from the extrapolated motion at which a registration is accepted alone."""
-    steps: int = 1
+    steps: int
     """Number of frames from the previous view to this one."""
 
     def placement(self, posteriors: Sequence[Posterior]) -> Placement:

@@ -19,7 +19,6 @@ ROUNDS = 8  # of iteratively reweighted least squares
 GAIN_SIGMA = 0.05  # prior sd of log gains; chosen by hand
 LEAST = 1e-3  # weight of the shading itself relative to that of the residuals; λ of eq. 12.11
 COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights; chosen by hand
-LARGEST_GAIN = 2.5  # largest factor between exposures; chosen by hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +95,7 @@ def _fitted(logs: Array, observed: Array, basis: Array) -> tuple[Array, Array]:
         basis: (f, n, h), zero on average.
     """
     gains, shading = np.zeros((len(logs), 3)), np.zeros((basis.shape[2], 3))
-    weights, clipped = observed, np.log(LARGEST_GAIN)
+    weights = observed
     # Differences between points that are the same in all views, as along the axis of a turntable, are not shading: of
     # all solutions that explain the colours equally well, the one with the least shading is chosen.
     least = LEAST * np.tensordot(observed[..., None] * basis, basis, ((0, 1), (0, 1))) + LEAST * np.eye(basis.shape[2])
@@ -114,7 +113,7 @@ def _fitted(logs: Array, observed: Array, basis: Array) -> tuple[Array, Array]:
         left = inner + least - across.T @ solved[:, 3:]
         shading = np.linalg.solve(left, -np.tensordot(weighted, off, ((0, 1), (0, 1))) - across.T @ solved[:, :3])
         gains = solved[:, :3] - solved[:, 3:] @ shading
-        gains = np.clip(gains - gains.mean(axis=0), -clipped, clipped)
+        gains = gains - gains.mean(axis=0)
         off = _centred(logs + gains[:, None] + basis @ shading, shares)
         weights = observed / (1.0 + np.mean(off**2, axis=2) / COLOUR_SIGMA**2)
     return gains, shading
