@@ -209,6 +209,16 @@ def test_a_disk_that_hangs_does_not_hold_the_run(
     released.set()
 
 
+def test_a_recording_that_is_deleted_meanwhile_does_not_stop_the_run(
+    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stream = open_stream("box", save=tmp_path / "r.rrd")
+    (tmp_path / "r.rrd").unlink()
+    stream(run[0])
+    stream.close()
+    assert caplog.text == ""
+
+
 def test_a_disk_that_fills_before_the_recording_begins_is_said(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
