@@ -185,7 +185,8 @@ def _slopes(cloud: _Cloud, *, backward: bool) -> Array:
     """Return x/z and y/z (n, 2) of the points before the camera."""
     points = cloud.points * (_TURNED if backward else 1.0)
     points = points[points[:, 2] > _LEAST_Z]
-    return points[:, :2] / points[:, 2:]
+    slopes = points[:, :2] / points[:, 2:]
+    return slopes[(np.abs(slopes) < _STEEPEST).all(axis=1)]
 
 
 def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
@@ -204,6 +205,7 @@ def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
 
 
 _MAX_ASPECT = 1.5
+_STEEPEST = 1e3  # no camera sees so far to the side
 _FINEST_PX, _COARSEST_PX = 5000.0, 50.0
 _BINS = 1 << 18
 _ON_GRID = 0.7  # of the largest possible power; of points anywhere it is a few hundredths

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -11,7 +12,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, image_size, open_image
+from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, image_size, open_image, quiet
 from modeler.sequences.input_files import entries, input_errors
 from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import InputError
@@ -121,19 +122,23 @@ def _read_exr(file: BinaryIO) -> npt.NDArray[np.generic]:
     import OpenEXR
 
     name = f"/dev/fd/{file.fileno()}"  # the library takes no open files
-    with OpenEXR.File(name, header_only=True) as header:
-        (left, top), (right, bottom) = (corner.tolist() for corner in header.header()["dataWindow"])
-        _check_size(right - left + 1, bottom - top + 1)
-    with OpenEXR.File(name, separate_channels=True) as image:
-        channels = image.channels()
-        order = ("z", "depth", "depth.v", "depth.z", "y", "v", "r")
-        found = {channel.lower(): value.pixels for channel, value in channels.items()}
-        best = next((found[channel] for channel in order if channel in found), None)
-        if best is None and len(found) == 1:
-            (best,) = found.values()
-        if best is None:
-            raise ValueError(f"none of its channels {', '.join(channels)} is depth")
-        return np.array(best)
+    with tempfile.TemporaryFile() as said:  # where it reports pixels that it could not read, and goes on
+        with quiet(said):
+            with OpenEXR.File(name, header_only=True) as header:
+                (left, top), (right, bottom) = (corner.tolist() for corner in header.header()["dataWindow"])
+                _check_size(right - left + 1, bottom - top + 1)
+            with OpenEXR.File(name, separate_channels=True) as image:
+                found = {channel.lower(): np.array(value.pixels) for channel, value in image.channels().items()}
+        said.seek(0)
+        if report := said.read(1000).decode("utf-8", "replace"):
+            raise ValueError(report.splitlines()[0].partition("EXR_ERR_")[2].rstrip(") ") or "its pixels are damaged")
+    order = ("z", "depth", "depth.v", "depth.z", "y", "v", "r")
+    best = next((found[channel] for channel in order if channel in found), None)
+    if best is None and len(found) == 1:
+        (best,) = found.values()
+    if best is None:
+        raise ValueError(f"none of its channels {', '.join(found)} is depth")
+    return best
 
 
 def depth_size(path: Path) -> tuple[int, int]:

@@ -57,7 +57,7 @@ def open_image(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Im
             with Image.open(stream, formats=formats) as image:
                 if image.width * image.height > MAX_PIXELS:
                     raise Image.DecompressionBombError
-                with _quiet() if image.format == "TIFF" else contextlib.nullcontext():
+                with quiet() if image.format == "TIFF" else contextlib.nullcontext():
                     image.load()
                 return image
     except InputError:
@@ -100,12 +100,12 @@ def _unlogged() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the library for TIFF from writing to stderr itself, which is one for all threads."""
+def quiet(into: IO[bytes] | None = None) -> Iterator[None]:
+    """Keep a library from writing to stderr, which is one for all threads: into a file, or nowhere."""
     with _STDERR:
         stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
         try:
-            os.dup2(nowhere, 2)
+            os.dup2(nowhere if into is None else into.fileno(), 2)
             yield
         finally:
             os.dup2(stderr, 2)

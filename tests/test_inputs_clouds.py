@@ -117,6 +117,14 @@ def test_points_off_a_grid_need_intrinsics(tmp_path: Path, frames: list[Frame], 
     assert open_sequence(tmp_path).frame(0).camera.fx == 143.75
 
 
+def test_points_beside_the_camera_are_passed_over(
+    tmp_path: Path, frames: list[Frame], rng: np.random.Generator
+) -> None:
+    points = seen_points(frames[0], rng)
+    write_points(tmp_path / "0.ply", np.concatenate([points, [[1e8, 1e8, 1e-5]]]))
+    assert np.count_nonzero(np.isfinite(open_sequence(tmp_path).frame(0).depth_m)) == len(points)
+
+
 def test_images_beside_clouds_are_used(tmp_path: Path, frames: list[Frame], rng: np.random.Generator) -> None:
     write_points(tmp_path / "0.ply", seen_points(frames[0], rng))
     save(tmp_path / "0_depth.png", raw_depth(frames[0], 1.0))

@@ -64,6 +64,21 @@ def test_depth_is_read_in_each_format(tmp_path: Path, frames: list[Frame], kind:
         np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=1e-6)
 
 
+def test_damaged_pixels_of_exr_are_one_line(
+    tmp_path: Path, frames: list[Frame], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The library reports them on stderr, and returns the others."""
+    path = tmp_path / "depth" / "0.exr"
+    exr(path, np.nan_to_num(frames[0].depth_m))
+    write_camera(tmp_path, frames[0].camera)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 40] = bytes(range(40))
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"0\.exr: is not a readable EXR file"):
+        open_sequence(tmp_path)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize("nothing", [65504.0, 1e10, np.inf, -1.0])
 def test_what_programs_write_for_nothing_is_no_depth(tmp_path: Path, frames: list[Frame], nothing: float) -> None:
     depth_m = np.where(np.isnan(frames[0].depth_m), np.float32(nothing), frames[0].depth_m)
