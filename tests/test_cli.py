@@ -204,10 +204,12 @@ def test_build_fills_a_run_folder(built: Path) -> None:
     assert (built / "recording.rrd").stat().st_size > 100_000
 
 
-def test_build_says_nothing_on_stdout_and_one_line_on_stderr(cli: Run, tmp_path: Path) -> None:
+def test_build_says_nothing_on_stdout_and_two_lines_on_stderr(cli: Run, tmp_path: Path) -> None:
     ended = cli("build", BOX, "--out", tmp_path / "run", *QUICK[:-1], "0:2")
     assert (ended.status, ended.out) == (0, "")
-    assert re.fullmatch(r"modeler: 2 of 2 frames, no loop closed, \d+ s: .*\n", ended.err)
+    assert re.fullmatch(
+        r"modeler: 2 of 2 frames, no loop closed, \d+ s: .*\nmodeler: the model can be trusted to .* mm\n", ended.err
+    )
 
 
 def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(cli: Run, built: Path, tmp_path: Path) -> None:
