@@ -379,5 +379,5 @@ def _read_ply(file: BinaryIO) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.f
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         read = load_ply(file)
-    colours = np.asarray(read.get("vertex_colors", np.zeros((0, 3))), dtype=np.float64)
-    return np.asarray(read["vertices"], dtype=np.float64), np.nan_to_num(colours).clip(0.0, 255.0)
+        colours = np.asarray(read.get("vertex_colors", np.zeros((0, 3))), dtype=np.float64)
+        return np.asarray(read["vertices"], dtype=np.float64), np.nan_to_num(colours).clip(0.0, 255.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import tempfile
@@ -123,7 +124,7 @@ def _read_exr(file: BinaryIO) -> npt.NDArray[np.generic]:
 
     name = f"/dev/fd/{file.fileno()}"  # the library takes no open files
     with tempfile.TemporaryFile() as said:  # where it reports pixels that it could not read, and goes on
-        with quiet(said):
+        with quiet(said), contextlib.redirect_stdout(io.StringIO()):  # where it warns of what it then raises
             with OpenEXR.File(name, header_only=True) as header:
                 (left, top), (right, bottom) = (corner.tolist() for corner in header.header()["dataWindow"])
                 _check_size(right - left + 1, bottom - top + 1)
