@@ -46,7 +46,7 @@ def test_report_has_the_promised_schema(tmp_path: Path) -> None:
     report = strict_json((tmp_path / "report.json").read_text())
     assert report == run.report()
     head = {key: report[key] for key in ("schema", "sequence", "seed", "prior", "seconds")}
-    assert head == {"schema": 1, "sequence": "box", "seed": 3, "prior": "table", "seconds": {"total": 1.5}}
+    assert head == {"schema": 2, "sequence": "box", "seed": 3, "prior": "table", "seconds": {"total": 1.5}}
     assert {"modeler", "gtsam", "numpy", "python"} <= set(report["versions"])
     assert report["frames"][1] == {
         "id": 5, "timestamp": 0.5, "points": 5, "outcome": "accepted", "cause": "", "mask": "converged"

@@ -75,7 +75,7 @@ def test_place_that_cannot_hold_a_run_is_said_in_one_line(tmp_path: Path) -> Non
             RunFolder.open(path, overwrite=True)
     with pytest.raises(InputError, match=r"no report; give a run folder"):
         RunFolder(tmp_path).report()
-    for content in ("{", "[]", '{"schema": 2}'):
+    for content in ("{", "[]", '{"schema": 3}'):
         (tmp_path / "report.json").write_text(content)
         with pytest.raises(InputError, match=r"report\.json: "):
             RunFolder(tmp_path).report()
@@ -175,7 +175,7 @@ def test_what_no_report_tells_of_is_not_resumed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("how", [{"overwrite": True}, {"resume": True}])
 def test_a_folder_that_is_no_run_is_left_alone(tmp_path: Path, how: dict[str, bool]) -> None:
     (tmp_path / "model.ply").write_text("somebody's own")
-    for report in (None, "{", '{"schema": 2}'):
+    for report in (None, "{", '{"schema": 3}'):
         if report is not None:
             (tmp_path / "report.json").write_text(report)
         before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

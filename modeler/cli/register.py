@@ -54,10 +54,11 @@ class Register:
                 failure = prepared.failure
                 raise InputError(f"{self.sequence}: frame {index} has {failure.label}. {outcome_advice(failure)}")
             views.append(prepared.view)
-        posterior = modeler.register(*views).widened(modeler.sensor.noise.sigma_focal)
+        posterior = modeler.register(*views)
         what_to_do = outcome_advice(posterior.outcome, modeler.prior, posterior)
         edge = Edge(posterior, "odometry", posterior.usable, Stated(as_options(what_to_do)))
-        record = {name: value for name, value in edge_record(edge, Solution()).items() if name != "seconds"}
+        record = edge_record(edge, Solution(), sigma_focal=modeler.sensor.noise.sigma_focal)
+        del record["seconds"]  # the same pair has the same record
         print(json.dumps(record, allow_nan=False))
         _, remark = compose.resolved_prior(self.prior, sequence)
         summary = [f"{posterior.outcome.label} after {posterior.seconds:.2f} s", *([remark] if remark else [])]

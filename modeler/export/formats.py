@@ -34,9 +34,9 @@ def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
     """Return the solved graph as VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines, numbers written in full.
 
     Vertices are object_from_camera, edges `target source target_from_source` as used: of an edge with several modes,
-    the selected one. Information matrices are of translation first, then rotation in rad, as g2o orders them and GTSAM
-    reads and writes them. (g2o itself measures rotation by the vector part of a quaternion, half the angle: it reads
-    such files, GTSAM's too, with twice the rotation uncertainty.)
+    the selected one. Information matrices are marginal over the focal length, of translation first, then rotation in
+    rad, as g2o orders them and GTSAM reads and writes them. (g2o itself measures rotation by the vector part of a
+    quaternion, half the angle: it reads such files, GTSAM's too, with twice the rotation uncertainty.)
 
     Args:
         edges: those that take part are written: accepted, no outliers, both ends solved.
@@ -49,7 +49,8 @@ def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
         solved = edge.target in solution.trajectory and edge.source in solution.trajectory
         if solved and solution.takes_part(edge):
             pose = solution.pose_of(edge)
-            numbers = " ".join(repr(float(value)) for value in _upper_triangle(pose.covariance))
+            covariance = pose.covariance if solution.focal is None else pose.widened(solution.focal.sigma).covariance
+            numbers = " ".join(repr(float(value)) for value in _upper_triangle(covariance))
             lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {pose_text(pose.mean)} {numbers}")
     return "".join(f"{line}\n" for line in lines)
 

@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -80,7 +80,7 @@ def read_model(path: Path) -> ObjectModel:
 
 
 def _kind(edge: Mapping[str, Any]) -> EdgeKind:
-    """Return the kind of an edge; reports count spans as odometry and joins as closures, with a separate flag."""
+    """Return the kind of an edge; schema 1 counts spans as odometry and joins as closures, with a separate flag."""
     return "span" if edge.get("span") else "join" if edge.get("join") else edge["kind"]
 
 
@@ -100,7 +100,8 @@ def _posterior(edge: Mapping[str, Any]) -> Posterior:
 
 
 def _gaussian(record: Mapping[str, Any]) -> PoseGaussian:
-    mean, covariance = _matrix(record["target_from_source"], 4), _matrix(record["covariance"], 6)
+    given_camera = record.get("covariance_given_camera") or record["covariance"]  # schema 1 has only that
+    mean, covariance = _matrix(record["target_from_source"], 4), _matrix(given_camera, 6)
     by_focal = record.get("by_focal")  # reports of earlier versions have none
     return PoseGaussian(mean, covariance, np.zeros(6) if by_focal is None else np.array([*map(_number, by_focal)]))
 
@@ -114,7 +115,8 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-_LATER = frozenset({"by_focal", "modes", "cause", "mask", "reason"})  # reports of earlier versions have none
+# Reports of earlier versions have none of these.
+_LATER = frozenset({"by_focal", "covariance_given_camera", "modes", "cause", "mask", "reason"})
 
 
 def fault(report: Mapping[str, Any]) -> str | None:
@@ -159,8 +161,9 @@ def _impossible(record: Mapping[str, Any]) -> str | None:
         for name in ("target_from_source", "object_from_camera"):
             if name in part and not _rigid(part[name]):
                 return repr(name)
-        if not _definite(part["covariance"], 0.0 if "accepted" in record else -_ROUND):
-            return "'covariance'"
+        for name in ("covariance", "covariance_given_camera"):
+            if part.get(name) and not _definite(part[name], 0.0 if "accepted" in record else -_ROUND):
+                return repr(name)
     return None
 
 
@@ -286,17 +289,19 @@ _MODE: dict[str, Test] = {
     "weight": _is_number_or_null,
     "target_from_source": _numbers(16),
     "covariance": _numbers(36),
+    "covariance_given_camera": _null_or(_numbers(36)),
     "by_focal": _null_or(_numbers(6)),
 }
 _EDGE: dict[str, Test] = {
     "source": _is_whole,
     "target": _is_whole,
-    "kind": lambda value: value in ("odometry", "closure"),
+    "kind": lambda value: value in get_args(EdgeKind),
     "accepted": _is(bool),
     "reason": _is_text,
     "outcome": lambda value: value in [outcome.label for outcome in Outcome],
     "target_from_source": _numbers(16),
     "covariance": _numbers(36),
+    "covariance_given_camera": _null_or(_numbers(36)),
     "by_focal": _null_or(_numbers(6)),
     "modes": _null_or(_are_modes),
     "overlap": _is_number_or_null,

@@ -15,7 +15,6 @@ from modeler import se3
 from modeler.types import (
     Array,
     Edge,
-    Mode,
     OptimisationOutlier,
     Plane,
     PoseGaussian,
@@ -30,7 +29,7 @@ from modeler.types import (
 from modeler.verdict import judged
 from modeler.verdict.evidence import total_depth_scale_sigma
 
-_SCHEMA = 1
+_SCHEMA = 2
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
 _FREE_RAD = np.radians(
     8.0
@@ -174,32 +173,39 @@ def _taking_part(step: Step) -> list[Edge]:
     return [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
 
 
-def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) -> dict[str, Any]:
+def edge_record(
+    edge: Edge, solution: Solution, view: RayImage | None = None, *, sigma_focal: float = 0.0
+) -> dict[str, Any]:
     """Return an edge as JSON values of the report.
 
     Args:
         edge: with its acceptance.
         solution: the poses, which may contradict it.
         view: the edge's source, used to name undetermined directions; None: only by the camera.
+        sigma_focal: standard deviation of the focal length's logarithm, if the solution has no estimate of it.
     """
+    sigma_focal = sigma_focal if solution.focal is None else solution.focal.sigma
     posterior = edge.posterior
     outlier = edge in solution.outliers
     left = solution.mode_weights.get((edge.source, edge.target)) if edge.accepted else None
     record = {
         "source": posterior.source,
         "target": posterior.target,
-        "kind": "closure" if edge.kind in ("closure", "join") else "odometry",
-        "span": edge.kind == "span",  # of the odometry, those that only join frames which others placed
-        "join": edge.kind == "join",  # of the closures, those between segments
+        "kind": edge.kind,
         "accepted": solution.takes_part(edge),
         "outcome": posterior.outcome.label,
         "reason": explain(OptimisationOutlier() if outlier else edge.reason),
-        "target_from_source": posterior.pose.mean,
-        "covariance": posterior.pose.covariance,
-        "by_focal": posterior.pose.by_focal,  # ξ by the logarithm of the focal length
+        **_pose_record(posterior.pose, sigma_focal),
         "beyond": list(posterior.beyond),
         "undetermined": undetermined(posterior, view),
-        "modes": [_mode_record(mode, None if left is None else left[k]) for k, mode in enumerate(posterior.modes)],
+        "modes": [
+            {
+                "weight": mode.weight,
+                "weight_in_graph": None if left is None else left[k],  # that all edges together leave to it
+                **_pose_record(mode.pose, sigma_focal),
+            }
+            for k, mode in enumerate(posterior.modes)
+        ],
         "effective_samples": posterior.effective_samples,
         "pareto_k": posterior.pareto_k,
         "log_evidence": posterior.log_evidence,
@@ -209,14 +215,13 @@ def edge_record(edge: Edge, solution: Solution, view: RayImage | None = None) ->
     return _json(record)
 
 
-def _mode_record(mode: Mode, left: float | None) -> dict[str, Any]:
-    """Return a mode as the report has it, with the weight that all edges together leave to it."""
+def _pose_record(pose: PoseGaussian, sigma_focal: float) -> dict[str, Any]:
+    """Return a pose as the report has it: its covariance is marginal over the focal length."""
     return {
-        "weight": mode.weight,
-        "weight_in_graph": left,
-        "target_from_source": mode.pose.mean,
-        "covariance": mode.pose.covariance,
-        "by_focal": mode.pose.by_focal,
+        "target_from_source": pose.mean,
+        "covariance": pose.widened(sigma_focal).covariance,
+        "covariance_given_camera": pose.covariance,
+        "by_focal": pose.by_focal,  # ξ by the logarithm of the focal length
     }
 
 

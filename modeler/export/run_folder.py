@@ -136,8 +136,8 @@ class RunFolder:
         if not os.path.lexists(path):
             raise InputError(f"{path}: no report; give a run folder instead of {self.path}")
         report = read_json(path)
-        if not isinstance(report, dict) or report.get("schema") != 1:
-            raise InputError(f"{path}: not a report of schema 1; build the run again")
+        if not isinstance(report, dict) or report.get("schema") not in (1, 2):
+            raise InputError(f"{path}: not a report of schema 1 or 2; build the run again")
         return report
 
     def result(self) -> dict[str, Any]:

@@ -216,7 +216,7 @@ def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 
 def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
     """Return how to estimate the focal length, if a loop determines it."""
-    if not any(edge["kind"] == "closure" for edge in report["edges"]):
+    if not any(edge["kind"] in ("closure", "join") for edge in report["edges"]):
         return _more_known(report, prior)
     first = "modeler calibrate-camera {run} `out` camera.json"
     return Remedy("estimate the focal length from the loop, and build with it", {"camera": "camera.json"}, first)
