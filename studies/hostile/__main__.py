@@ -134,9 +134,7 @@ def hostile_folder(trial: Trial, rng: np.random.Generator) -> None:
 
 def limits(trial: Trial, rng: np.random.Generator) -> None:
     """Limit what the command may use."""
-    limit = str(
-        rng.choice(["-n 8", "-n 40", "-n 300", "-f 100", "-f 2000", "-v 400000", "-v 3000000", "-u 20", "-s 256"])
-    )
+    limit = str(rng.choice(_LIMITS))
     trial.shell = f"ulimit {limit}; {trial.shell}"
     trial.said.append(f"ulimit {limit}")
 
