@@ -3,6 +3,7 @@
 # make test       the whole gate: format, lint, types, layers, tests
 # make test-slow  the slow tests, which make test leaves out
 # make docs       the guide as a site: build/site/index.html (installs the extra docs; warnings are errors)
+# make results    the figures of docs/results.md and README.md, written from the files of studies/results
 # make calibrate  calibration of covariances, on rendered pairs and other cameras (many minutes)
 # make trust      reliability of status 0: 150 rendered runs, half with a fault (some 20 minutes a core)
 # make ablation   contribution of each stage and constant of the default registration (many hours)
@@ -15,7 +16,7 @@
 BIN := .venv/bin
 TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
 
-.PHONY: setup demo test test-slow docs calibrate trust ablation bench bench-gpu scale same audit
+.PHONY: setup demo test test-slow docs results calibrate trust ablation bench bench-gpu scale same audit
 
 setup: .venv/.installed
 
@@ -49,6 +50,9 @@ docs: .venv/.docs
 .venv/.docs: .venv/.installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	touch $@
+
+results: setup
+	$(BIN)/python -m studies results
 
 calibrate: setup
 	$(BIN)/python -m studies calibration

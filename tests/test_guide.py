@@ -38,7 +38,7 @@ NOT_HERE = {
 QUICK = ("README", "build")
 SEQUENCES = "sequences/bundled/box sequences/bundled/tube turned poked carried shelf/cup shelf/tin".split()
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
-WITH_COMMANDS = (*PAGES.values(), DOCS / "measurements.md", CONTRIBUTING)
+WITH_COMMANDS = (*PAGES.values(), DOCS / "measurements.md", DOCS / "results.md", CONTRIBUTING)
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
 

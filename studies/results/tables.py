@@ -1,0 +1,80 @@
+"""Tables of figures: what a file holds, and its Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+FOLDER: Final = Path(__file__).parent
+NOT_KNOWN: Final = "not known"
+"""The commit of a table that does not say when it was measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table of figures, with how to measure them."""
+
+    study: str
+    """Name under `python -m studies`, or the command of modeler that measures."""
+    command: tuple[str, ...]
+    """Lines for a shell that measure the figures."""
+    commit: str
+    """Short hash of the commit that was measured; `earlier`, or NOT_KNOWN, where no hash was noted."""
+    columns: tuple[str, ...]
+    """Titles, in Markdown."""
+    rows: tuple[tuple[str | float, ...], ...]
+    """Cells of each row, in Markdown or as numbers."""
+    note: tuple[str, ...]
+    """What else was measured, and what the figures mean: one item of a list each, in Markdown."""
+
+    def markdown(self) -> str:
+        """Return the commands, the table, the commit where it is known, and the notes."""
+        parts = ["```sh\n" + "\n".join(self.command) + "\n```", markdown(self.columns, self.rows)]
+        if self.commit != NOT_KNOWN:
+            parts.append(f"*Commit: {self.commit}.*")
+        if self.note:
+            parts.append("\n".join(f"- {item}" for item in self.note))
+        return "\n\n".join(parts)
+
+
+def read(path: Path) -> Table:
+    """Return the table of a file.
+
+    Raises:
+        TypeError: the file has other keys than a table has fields.
+        ValueError: a row has not as many cells as there are columns.
+    """
+    found = json.loads(path.read_text())
+    rows = tuple(tuple(row) for row in found.pop("rows"))
+    commit, study = found.pop("commit"), found.pop("study")
+    table = Table(study=study, commit=commit, rows=rows, **{name: tuple(items) for name, items in found.items()})
+    if any(len(row) != len(table.columns) for row in rows):
+        raise ValueError(f"{path}: a row has not as many cells as there are columns")
+    return table
+
+
+def read_all() -> dict[str, Table]:
+    """Return the tables of all files by name."""
+    return {path.stem: read(path) for path in sorted(FOLDER.glob("*.json"))}
+
+
+def markdown(columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> str:
+    """Return a table of Markdown."""
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+    return "\n".join([*lines, *(f"| {' | '.join(map(str, row))} |" for row in rows)])
+
+
+def between(text: str, begin: str, end: str, inner: str) -> str:
+    """Return a text with other lines between two marks.
+
+    Raises:
+        ValueError: the text lacks one of the marks.
+    """
+    before, first, rest = text.partition(begin)
+    _, last, after = rest.partition(end)
+    if not (first and last):
+        raise ValueError(f"no {begin} … {end}")
+    return f"{before}{begin}\n{inner}\n{end}{after}"
