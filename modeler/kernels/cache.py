@@ -16,6 +16,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -33,6 +34,7 @@ _HERE: Final = Path(__file__).parent
 _DIGEST_BYTES: Final = 32
 _MOST_BYTES: Final = 1 << 26  # of a file
 _ALL_BYTES: Final = 1 << 24  # of all files together, with room to spare
+_STALE_S: Final = 7 * 86400.0  # since a kernel was added
 _SETTINGS: Final = ("NUM_THREADS", "THREADING_LAYER", "THREADING_LAYER_PRIORITY", "CACHE_DIR")
 """Settings of Numba that do not change the code that it compiles."""
 
@@ -178,5 +180,13 @@ def _written(path: Path, data: bytes) -> bool:
 
 
 def _stale(folder: Path) -> Iterator[Path]:
-    """Yield the folders of kernels that this machine compiled from other contents of the same sources."""
-    yield from (other for other in folder.parent.glob(f"kernels-{_MACHINE}-*") if other != folder)
+    """Yield the folders of kernels that this machine compiled from other contents of the same sources, long ago.
+
+    A process that began with those may still add to them.
+    """
+    long_ago_s = time.time() - _STALE_S
+    yield from (
+        other
+        for other in folder.parent.glob(f"kernels-{_MACHINE}-*")
+        if other != folder and other.stat().st_mtime < long_ago_s
+    )
