@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from studies.ablation.constants.source import Number, all_numbers
+from studies.results.tables import markdown
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,9 +35,9 @@ def table(numbers: Sequence[Number]) -> str:
     """Return the counts by room, in Markdown: constants of modules, defaults of fields, and both."""
     rooms = Counter(number.room for number in numbers)
     fields = Counter(number.room for number in numbers if "." in number.name)
-    rows = [f"| {room} | {count - fields[room]} | {fields[room]} | {count} |" for room, count in rooms.most_common()]
-    whole = f"| all | {len(numbers) - fields.total()} | {fields.total()} | {len(numbers)} |"
-    return "\n".join(["| room | constants | fields | numbers |", "|---|---|---|---|", *rows, whole])
+    rows = [(room, count - fields[room], fields[room], count) for room, count in rooms.most_common()]
+    whole = ("all", len(numbers) - fields.total(), fields.total(), len(numbers))
+    return markdown(("room", "constants", "fields", "numbers"), [*rows, whole])
 
 
 if __name__ == "__main__":

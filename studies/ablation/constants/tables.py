@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from studies.results.tables import between, markdown
+
 RESULTS: Final = Path(__file__).with_name("results.json")
 """What has been measured, in brief."""
 _FIGURES: Final = {
@@ -91,15 +93,13 @@ def table(results: Path) -> str:
         rows = [
             (name.partition(".")[2], *(_words(found[name].get(way)) for way in ("halved", "doubled"))) for name in names
         ]
-        parts.append(f"### {room.capitalize()}\n\n" + _markdown(("number", "halved", "doubled"), rows))
+        parts.append(f"### {room.capitalize()}\n\n" + markdown(("number", "halved", "doubled"), rows))
     return "\n\n".join(parts)
 
 
 def on_page(page: str, tables: str) -> str:
     """Return the text of the page with these tables between its two marks."""
-    before, _, rest = page.partition(_BEGIN)
-    _, _, after = rest.partition(_END)
-    return f"{before}{_BEGIN}\n\n{tables}\n\n{_END}{after}"
+    return between(page, _BEGIN, _END, f"\n{tables}\n")
 
 
 def _summary(rooms: Mapping[str, Sequence[str]], found: Mapping[str, Mapping[str, Any]]) -> str:
@@ -107,7 +107,7 @@ def _summary(rooms: Mapping[str, Sequence[str]], found: Mapping[str, Mapping[str
     for room, names in rooms.items():
         kinds = [_kind(found[name]) for name in names]
         rows.append((room, str(len(names)), *(str(kinds.count(kind)) for kind in ("none", "bits", "figures"))))
-    return _markdown(("room", "numbers", "no effect", "effect below 0.1 %", "effect"), rows)
+    return markdown(("room", "numbers", "no effect", "effect below 0.1 %", "effect"), rows)
 
 
 def _kind(ways: Mapping[str, Mapping[str, Any]]) -> str:
@@ -130,8 +130,3 @@ def _words(way: Mapping[str, Any] | None) -> str:
         for name, (before, after) in figures.items()
     ]
     return f"{way['input']}: {'; '.join(changes) or 'figures the same to 0.1 %'}"
-
-
-def _markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [f"| {' | '.join(titles)} |", "|" + "---|" * len(titles)]
-    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
