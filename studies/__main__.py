@@ -38,7 +38,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "loops.focal_lengths": ("focal lengths estimated from loops", "minutes"),
     "loops.memory": ("memory and time of builds of thousands of frames", "minutes to hours"),
     "numbers": ("named numbers of the package by room", "seconds"),
-    "results": ("write docs/results.md and the README's figures from their files", "a second"),
+    "results": ("write the tables of pages from the files that hold them", "a second"),
     "same_bytes": ("results of this tree and of another commit, byte by byte", "minutes"),
     "scale": ("throughput of batches", "15 minutes"),
     "scenes": ("segmentation of rendered scenes, models behind hands and grippers", "half an hour"),

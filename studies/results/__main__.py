@@ -1,10 +1,10 @@
-"""Write docs/results.md and the README's line of figures from the files that hold their figures.
+"""Write the tables of docs/results.md and docs/ablation.md, and the README's figures, from the files that hold them.
 
     make results
 
-Each table is a file of studies/results/: its study, the commands that measure it, the commit at which it was
-measured, columns, rows and notes. The prose between the tables is studies/results/page.md. To change a figure, measure
-it, change its file, and write the pages anew.
+Each table is a file of studies/results/: its study, the commands that measure it, the commit at which it was measured,
+columns, rows and notes. To change a figure, measure it, change its file, and write the pages anew; what stands between
+the marks of a page is overwritten, the rest is prose.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from studies.results.page import PAGE, README, readme, rendered
+from studies.results.page import PAGES, rendered
 from studies.results.tables import read_all
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write both pages."""
+    """Write the pages."""
     parser = argparse.ArgumentParser(
         prog="python -m studies results", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.parse_args(arguments)
     tables = read_all()
-    PAGE.write_text(rendered(tables))
-    README.write_text(readme(README.read_text(), tables))
+    for page in PAGES:
+        page.write_text(rendered(page.read_text(), tables))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Pages whose figures come from files: docs/results.md, and the README's line."""
+"""Pages whose figures come from files: the regions between `<!-- kind: name -->` and `<!-- /kind -->`."""
 
 from __future__ import annotations
 
@@ -8,28 +8,24 @@ from pathlib import Path
 from textwrap import fill
 from typing import Final
 
-from studies.results.tables import Table, between
+from studies.results.tables import Table
 
 _ROOT: Final = Path(__file__).parents[2]
-PAGE: Final = _ROOT / "docs" / "results.md"
-README: Final = _ROOT / "README.md"
-TEMPLATE: Final = Path(__file__).with_name("page.md")
-"""The prose of PAGE, with `{{name}}` in place of each table."""
-PLACE: Final = re.compile(r"^\{\{(\w+)\}\}$", re.MULTILINE)
-_GENERATED: Final = "<!-- `make results` writes this page from studies/results/; change it there -->\n\n"
-_BEGIN: Final = "<!-- figures: captures -->"
-_END: Final = "<!-- /figures -->"
+PAGES: Final = (_ROOT / "docs" / "results.md", _ROOT / "docs" / "ablation.md", _ROOT / "README.md")
+REGION: Final = re.compile(r"^<!-- (table|figures): (\w+) -->\n(.*?)^<!-- /\1 -->$", re.MULTILINE | re.DOTALL)
+"""Kind, name and present text of what a file holds: a whole table, or a sentence made of it."""
 _NUMBERS: Final = "no one two three four five six seven eight nine ten eleven twelve".split()
 
 
-def rendered(tables: Mapping[str, Table]) -> str:
-    """Return the text of PAGE."""
-    return _GENERATED + PLACE.sub(lambda place: tables[place[1]].markdown(), TEMPLATE.read_text())
+def rendered(page: str, tables: Mapping[str, Table]) -> str:
+    """Return the text of a page with the tables, and sentences on them, as their files have them."""
 
+    def region(found: re.Match[str]) -> str:
+        kind, name = found[1], found[2]
+        inner = f"\n{tables[name].markdown()}\n" if kind == "table" else fill(_SENTENCES[name](tables), 120)
+        return f"<!-- {kind}: {name} -->\n{inner}\n<!-- /{kind} -->"
 
-def readme(text: str, tables: Mapping[str, Table]) -> str:
-    """Return the text of the README with its line of figures as the files have them."""
-    return between(text, _BEGIN, _END, fill(_captures(tables), 120))
+    return REGION.sub(region, page)
 
 
 def _captures(tables: Mapping[str, Table]) -> str:
@@ -49,3 +45,6 @@ def _captures(tables: Mapping[str, Table]) -> str:
         f" largest rotation errors are {min(errors, key=float)}° to {max(errors, key=float)}° where truth is known,"
         f" {_NUMBERS[trusted]} models can be trusted, and {count} of {size} take {float(build[1]):.0f} s on two cores."
     )
+
+
+_SENTENCES: Final = {"captures": _captures}

@@ -65,16 +65,3 @@ def markdown(columns: Sequence[str], rows: Sequence[Sequence[str | float]]) -> s
     """Return a table of Markdown."""
     lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     return "\n".join([*lines, *(f"| {' | '.join(map(str, row))} |" for row in rows)])
-
-
-def between(text: str, begin: str, end: str, inner: str) -> str:
-    """Return a text with other lines between two marks.
-
-    Raises:
-        ValueError: the text lacks one of the marks.
-    """
-    before, first, rest = text.partition(begin)
-    _, last, after = rest.partition(end)
-    if not (first and last):
-        raise ValueError(f"no {begin} … {end}")
-    return f"{before}{begin}\n{inner}\n{end}{after}"

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from studies.results.tables import between, markdown
+from studies.results.tables import markdown
 
 RESULTS: Final = Path(__file__).with_name("results.json")
 """What has been measured, in brief."""
@@ -99,7 +99,9 @@ def table(results: Path) -> str:
 
 def on_page(page: str, tables: str) -> str:
     """Return the text of the page with these tables between its two marks."""
-    return between(page, _BEGIN, _END, f"\n{tables}\n")
+    before, _, rest = page.partition(_BEGIN)
+    _, _, after = rest.partition(_END)
+    return f"{before}{_BEGIN}\n\n{tables}\n\n{_END}{after}"
 
 
 def _summary(rooms: Mapping[str, Sequence[str]], found: Mapping[str, Mapping[str, Any]]) -> str:
