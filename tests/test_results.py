@@ -10,7 +10,7 @@ import pytest
 
 from studies.__main__ import STUDIES
 from studies.results.page import PAGES, REGION, rendered
-from studies.results.tables import NOT_KNOWN, Table, read, read_all
+from studies.results.tables import FOLDER, NOT_KNOWN, Table, read, read_all, record
 
 TABLES = read_all()
 
@@ -54,3 +54,23 @@ def test_a_row_with_a_cell_too_few_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(ValueError, match="as many cells"):
         read(path)
+
+
+def test_files_are_as_studies_write_them() -> None:
+    assert [name for name, table in TABLES.items() if (FOLDER / f"{name}.json").read_text() != table.text()] == []
+
+
+def test_measured_rows_replace_those_of_their_name(tmp_path: Path) -> None:
+    path = tmp_path / "some.json"
+    rows = (("first", 1), ("second", 2))
+    some = Table(study="s", command=("make x",), commit=NOT_KNOWN, columns=("", "count"), rows=rows, note=("Noted.",))
+    path.write_text(some.text())
+    record(path, [("second", 3)])
+    found = read(path)
+    assert found.rows == (("first", 1), ("second", 3))
+    assert re.fullmatch(r"not known; second: [0-9a-f]{7,}(-dirty)?", found.commit)
+    record(path, [("first", 4), ("second", 5)])
+    assert re.fullmatch(r"[0-9a-f]{7,}(-dirty)?", read(path).commit)
+    assert read(path).note == some.note
+    with pytest.raises(ValueError, match="third"):
+        record(path, [("third", 1)])

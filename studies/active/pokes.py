@@ -18,21 +18,30 @@ from modeler.views import Sensor
 from studies.active.robot import SimulatedRobot
 from studies.active.trial import REACH_DEG, relative_error_deg, shown, sigma_deg, small
 from studies.calibration.specimens import SPECIMENS, load_specimen
+from studies.results.tables import FOLDER, markdown, record
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies active.pokes")
     parser.add_argument("--shapes", type=int, default=6, help="of each class")
+    parser.add_argument("--record", action="store_true", help="put the sd of each shape into the results")
     options = parser.parse_args()
-    print("| shape | poke turns | sd of rotation after it, predicted -> stated (error) | after a turn as far |")
-    print("|---|---|---|---|")
+    rows = []
     for kind in ("revolution", "near-symmetric"):
         names = [s.recipe for s in SPECIMENS if s.half == "held-out" and s.symmetry == kind]
         for name in names[: options.shapes]:
-            print(row(name), flush=True)
+            rows.append(row(name))
+            print(" | ".join(rows[-1]), flush=True)
+    print(
+        markdown(
+            ("shape", "poke turns", "sd of rotation after it, predicted → stated (error)", "after a turn as far"), rows
+        )
+    )
+    if options.record:
+        record(FOLDER / "pokes.json", rows)
 
 
-def row(name: str) -> str:
+def row(name: str) -> tuple[str, ...]:
     """Return the first poke at a shape, and a turn by the same unmeasured angle."""
     robot, rng = SimulatedRobot.before(small(load_specimen(name), 0, 320)), np.random.default_rng(0)
     table = Modeler(sensor=Sensor(robot.stage.sequence.sensor()), prior=TablePrior(max_rotation_deg=REACH_DEG))
@@ -55,10 +64,10 @@ def row(name: str) -> str:
         if found.accepted:
             stated = sigma_deg(found.solution.relative_covariance(0, 1))
             error_deg = relative_error_deg(found, after.stage.truth(), 0, 1)
-            said.append(f"{predicted:.1f}° -> {stated:.1f}° ({error_deg:.1f}°)")
+            said.append(f"{predicted:.1f}° → {stated:.1f}° ({error_deg:.1f}°)")
         else:
-            said.append(f"{predicted:.1f}° -> left out")
-    return f"| {name} | {poke.turn_deg:.0f}° | {said[0]} | {said[1]} |"
+            said.append(f"{predicted:.1f}° → left out")
+    return name.replace("_", " "), f"{poke.turn_deg:.0f}°", *said
 
 
 if __name__ == "__main__":

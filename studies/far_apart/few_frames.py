@@ -29,6 +29,7 @@ from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Step
 from studies.calibration.specimens import SPECIMENS, Half, load_specimen
 from studies.calibration.study import Condition, staged
+from studies.results.tables import FOLDER, record
 from studies.trust.study import MAX_DEG, MAX_M
 
 SHAPES: Final = 16
@@ -71,13 +72,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--shapes", type=int, default=SHAPES, metavar="N", help="how many")
     parser.add_argument("--only", nargs="+", metavar="SHAPE", help="these shapes")
     parser.add_argument("--prior", default="auto", help="auto, general, or table")
+    parser.add_argument("--record", action="store_true", help="put the counts into the results")
     options = parser.parse_args(arguments)
+    if options.record and (options.only or options.shapes != SHAPES or options.prior != "auto"):
+        parser.error(
+            "the results are of all shapes under the default prior: --record goes with --half and --views alone"
+        )
     names = options.only or shapes(options.half, options.shapes)
     known = []
     for name in names:
         known.append(built(name, options.views, options.prior))
         print(line(known[-1]), flush=True)
-    print(counts(known))
+    found = kinds(known)
+    print("\n".join(f"{kind}: {count}, {trusted} of them with status 0" for kind, (count, trusted) in found.items()))
+    if options.record:
+        (whole, sure), (some, _), (wrong, lying) = found.values()
+        row = (f"{options.views} views, {options.half} half", len(known), whole, sure, some, wrong, lying)
+        record(FOLDER / "few_frames.json", [row])
     return int(any(one.wrong and one.status == 0 for one in known))
 
 
@@ -133,17 +144,14 @@ def line(one: Built) -> str:
     )
 
 
-def counts(known: Sequence[Built]) -> str:
-    """Return how many models have all frames, how many some, and how many are wrong, with either status."""
-    kinds = {
+def kinds(known: Sequence[Built]) -> dict[str, tuple[int, int]]:
+    """Return how many models have all frames, some frames, or are wrong, and how many of each have status 0."""
+    parts = {
         "all frames, right": [one for one in known if one.placed == one.frames and not one.wrong],
         "some frames, right": [one for one in known if one.placed < one.frames and not one.wrong],
         "wrong": [one for one in known if one.wrong],
     }
-    return "\n".join(
-        f"{kind}: {len(ones)}, {sum(one.status == 0 for one in ones)} of them with status 0"
-        for kind, ones in kinds.items()
-    )
+    return {kind: (len(ones), sum(one.status == 0 for one in ones)) for kind, ones in parts.items()}
 
 
 if __name__ == "__main__":

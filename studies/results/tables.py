@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -38,6 +39,39 @@ class Table:
         if self.note:
             parts.append("\n".join(f"- {item}" for item in self.note))
         return "\n\n".join(parts)
+
+    def text(self) -> str:
+        """Return what a file holds: a line a row, so that changes show as such."""
+        parts = []
+        for name, found in asdict(self).items():
+            value = json.dumps(found, ensure_ascii=False)
+            if name in ("command", "rows", "note") and found:
+                lines = ",\n".join(f"  {json.dumps(one, ensure_ascii=False)}" for one in found)
+                value = f"[\n{lines}\n ]"
+            parts.append(f' "{name}": {value}')
+        return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def record(path: Path, rows: Sequence[Sequence[str | float]]) -> None:
+    """Put measured rows into a file in place of those with the same first cell, with the commit of this tree.
+
+    Args:
+        path: file of the table.
+        rows: rows measured now, each with a cell a column.
+
+    Raises:
+        ValueError: the table has no row that begins as one of them.
+    """
+    table = read(path)
+    measured = {row[0]: tuple(row) for row in rows}
+    if unknown := set(measured) - {row[0] for row in table.rows}:
+        raise ValueError(f"{path}: no row begins with {', '.join(map(str, sorted(unknown, key=str)))}")
+    describe = ["git", "describe", "--always", "--dirty", "--exclude", "*", "--abbrev=7"]
+    commit = subprocess.run(describe, cwd=FOLDER, capture_output=True, text=True, check=True).stdout.strip()
+    if len(measured) < len(table.rows):
+        commit = f"{table.commit}; {', '.join(map(str, measured))}: {commit}"
+    new = tuple(measured.get(row[0], row) for row in table.rows)
+    path.write_text(replace(table, rows=new, commit=commit).text())
 
 
 def read(path: Path) -> Table:

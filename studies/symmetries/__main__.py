@@ -28,7 +28,10 @@ from modeler.sequences.rendering.recipe import Recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.trajectory import Turntable
 from studies.calibration.specimens import SPECIMENS, Specimen, load_specimen
+from studies.results.tables import FOLDER, markdown, record
 
+EACH: Final = 15
+"""Shapes of each class."""
 NOISE_M: Final = 4e-4
 """Standard deviation of the places of a true mesh."""
 GRAIN_M: Final = 5e-3
@@ -36,15 +39,19 @@ GRAIN_M: Final = 5e-3
 FRAMES: Final = 15
 STEP_DEG: Final = 24.0
 DISTANCE_M: Final = 0.6
+_FOUND: Final = ("none", "n-fold", "revolution")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="python -m studies symmetries", description=__doc__)
-    parser.add_argument("--each", type=int, default=15, help="shapes of each of the four classes")
+    parser.add_argument("--each", type=int, default=EACH, help="shapes of each of the four classes")
     parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="of the calibration study")
     parser.add_argument("--built", action="store_true", help="build the models instead of taking true meshes")
+    parser.add_argument("--record", action="store_true", help="put what is found of built models into the results")
     options = parser.parse_args(arguments)
+    if options.record and not (options.built and options.half == "tuning" and options.each == EACH):
+        parser.error("the results are of built models of the tuning half: --record goes with --built alone")
     by_class: dict[str, list[Specimen]] = {}
     for specimen in SPECIMENS:
         if specimen.half == options.half:
@@ -66,7 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "seconds": round(time.monotonic() - began_s, 1),
         }
         print(json.dumps(row), file=sys.stderr, flush=True)
-    print(_table(counts))
+    rows = _rows(counts)
+    print(markdown(("", *_FOUND), rows))
+    if options.record:
+        record(FOLDER / "symmetries.json", rows)
     invented = sum(n for (known, told), n in counts.items() if _expected(known) == "none" and told != "none")
     right = sum(n for (known, told), n in counts.items() if _expected(known) == told)
     return 0 if invented == 0 and 12 * right >= 11 * counts.total() else 1
@@ -109,12 +119,10 @@ def _expected(symmetry: str) -> str:
     return "none" if symmetry in ("asymmetric", "near-symmetric") else symmetry
 
 
-def _table(counts: Counter[tuple[str, str]]) -> str:
-    """Return how many shapes of each class were put into which, in Markdown."""
-    known = list(dict.fromkeys(one for one, _ in counts))
-    told = ("none", "n-fold", "revolution")
-    rows = [f"| {one} | " + " | ".join(str(counts[one, other]) for other in told) + " |" for one in known]
-    return "\n".join([f"| | {' | '.join(told)} |", "|---" * (len(told) + 1) + "|", *rows])
+def _rows(counts: Counter[tuple[str, str]]) -> list[tuple[str | int, ...]]:
+    """Return how many shapes of each class were put into which."""
+    known = dict.fromkeys(one for one, _ in counts)
+    return [(one, *(counts[one, found] for found in _FOUND)) for one in known]
 
 
 if __name__ == "__main__":

@@ -15,28 +15,42 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import Final
 
 import numba
 
+from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
-from studies.trust.plan import HALVES, Half, Plan
+from studies.trust.plan import HALVES, SOUND, Half, Plan
 from studies.trust.study import Outcome, outcome
-from studies.trust.tables import text
+from studies.trust.tables import counts, text
+
+RUNS: Final = 150
+"""Of a half."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="python -m studies trust", description=__doc__)
     parser.add_argument("--half", choices=HALVES, default="tuning", help="which shapes and draws")
-    parser.add_argument("--runs", type=int, default=150, metavar="N", help="of the half, every other one sound")
+    parser.add_argument("--runs", type=int, default=RUNS, metavar="N", help="of the half, every other one sound")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/trust"), help="folder of the results")
+    parser.add_argument("--record", action="store_true", help="put the counts of all 150 runs into the results")
     options = parser.parse_args(arguments)
     if options.runs < 1 or options.jobs < 1:
         parser.error("--runs and --jobs take whole numbers from 1 on")
+    if options.record and options.runs != RUNS:
+        parser.error(f"the results are of all {RUNS} runs of a half: --record goes without --runs")
     options.out.mkdir(parents=True, exist_ok=True)
     outcomes = run(options.half, options.runs, options.jobs, options.out / f"{options.half}.jsonl")
     print(text(outcomes))
+    if options.record:
+        sound, faulty = ([one for one in outcomes if (one.fault == SOUND) is wanted] for wanted in (True, False))
+        rows = [
+            (f"{options.half} half, {name}", *counts(part)) for name, part in ((SOUND, sound), ("with a fault", faulty))
+        ]
+        record(FOLDER / "trust.json", rows)
     return 0
 
 

@@ -20,12 +20,15 @@ def text(outcomes: Sequence[Outcome]) -> str:
 
 
 def _line(name: str, outcomes: Sequence[Outcome]) -> str:
-    """Return one line; a rejected input counts as not trusted."""
-    counts = [
-        sum(one.wrong is wrong and (one.status == 0) is trusted for one in outcomes)
-        for wrong, trusted in ((True, True), (True, False), (False, True), (False, False))
-    ]
-    return _row((name, str(len(outcomes)), *map(str, counts)))
+    return _row((name, *map(str, counts(outcomes))))
+
+
+def counts(outcomes: Sequence[Outcome]) -> tuple[int, ...]:
+    """Return the number of runs, of wrong ones with status 0 and 3, and of right ones; a rejected input has 3."""
+    kinds = ((True, True), (True, False), (False, True), (False, False))
+    return len(outcomes), *(
+        sum(one.wrong is wrong and (one.status == 0) is trusted for one in outcomes) for wrong, trusted in kinds
+    )
 
 
 def _row(cells: Sequence[str]) -> str:
