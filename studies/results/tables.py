@@ -69,7 +69,9 @@ def record(path: Path, rows: Sequence[Sequence[str | float]]) -> None:
     describe = ["git", "describe", "--always", "--dirty", "--exclude", "*", "--abbrev=7"]
     commit = subprocess.run(describe, cwd=FOLDER, capture_output=True, text=True, check=True).stdout.strip()
     if len(measured) < len(table.rows):
-        commit = f"{table.commit}; {', '.join(map(str, measured))}: {commit}"
+        names = " and ".join(map(str, measured))
+        others = [part for part in table.commit.split("; ") if not part.startswith(f"{names}: ")]
+        commit = "; ".join([*others, f"{names}: {commit}"])
     new = tuple(measured.get(row[0], row) for row in table.rows)
     path.write_text(replace(table, rows=new, commit=commit).text())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any, Final
 
 from studies.results.tables import markdown
@@ -90,10 +91,16 @@ def table(results: Path) -> str:
         rooms.setdefault(name.partition(".")[0], []).append(name)
     parts = [_summary(rooms, found)]
     for room, names in rooms.items():
+        kinds = {name: _kind(found[name]) for name in names}
         rows = [
-            (name.partition(".")[2], *(_words(found[name].get(way)) for way in ("halved", "doubled"))) for name in names
+            (name.partition(".")[2], *(_words(found[name].get(way)) for way in ("halved", "doubled")))
+            for name, kind in kinds.items()
+            if kind != "none"
         ]
         parts.append(f"### {room.capitalize()}\n\n" + markdown(("number", "halved", "doubled"), rows))
+        same = [f"`{name.partition('.')[2]}`" for name, kind in kinds.items() if kind == "none"]
+        if same:
+            parts.append(fill(f"The same on all inputs: {', '.join(same)}.", 120, break_on_hyphens=False))
     return "\n\n".join(parts)
 
 
