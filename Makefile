@@ -3,7 +3,7 @@
 # make test       the whole gate: format, lint, types, layers, tests
 # make test-slow  the slow tests, which make test leaves out
 # make docs       the guide as a site: build/site/index.html (installs the extra docs; warnings are errors)
-# make results    the tables of docs/results.md, docs/ablation.md and README.md, from the files of studies/results
+# make results    the tables of docs/ and the figures of README.md, from the files of studies/results
 # make calibrate  calibration of covariances, on rendered pairs and other cameras (many minutes)
 # make trust      reliability of status 0: 150 rendered runs, half with a fault (some 20 minutes a core)
 # make ablation   contribution of each stage and constant of the default registration (many hours)

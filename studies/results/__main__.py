@@ -1,4 +1,4 @@
-"""Write the tables of docs/results.md and docs/ablation.md, and the README's figures, from the files that hold them.
+"""Write the tables of pages on measurements, and the README's figures, from the files that hold them.
 
     make results
 

@@ -11,7 +11,10 @@ from typing import Final
 from studies.results.tables import Table
 
 _ROOT: Final = Path(__file__).parents[2]
-PAGES: Final = (_ROOT / "docs" / "results.md", _ROOT / "docs" / "ablation.md", _ROOT / "README.md")
+PAGES: Final = (
+    *(_ROOT / "docs" / f"{name}.md" for name in ("results", "measurements", "ablation")),
+    _ROOT / "README.md",
+)
 REGION: Final = re.compile(r"^<!-- (table|figures): (\w+) -->\n(.*?)^<!-- /\1 -->$", re.MULTILINE | re.DOTALL)
 """Kind, name and present text of what a file holds: a whole table, or a sentence made of it."""
 _NUMBERS: Final = "no one two three four five six seven eight nine ten eleven twelve".split()

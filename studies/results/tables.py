@@ -11,7 +11,7 @@ from typing import Final
 
 FOLDER: Final = Path(__file__).parent
 NOT_KNOWN: Final = "not known"
-"""The commit of a table that does not say when it was measured."""
+"""In place of a commit or a study that was not noted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,9 +19,9 @@ class Table:
     """A table of figures, with how to measure them."""
 
     study: str
-    """Name under `python -m studies`, or the command of modeler that measures."""
+    """Name under `python -m studies`, or the command of modeler that measures, or NOT_KNOWN."""
     command: tuple[str, ...]
-    """Lines for a shell that measure the figures."""
+    """Lines for a shell that measure the figures; none if the page has them, or no command measures them any more."""
     commit: str
     """Short hash of the commit that was measured; `earlier`, or NOT_KNOWN, where no hash was noted."""
     columns: tuple[str, ...]
@@ -33,7 +33,8 @@ class Table:
 
     def markdown(self) -> str:
         """Return the commands, the table, the commit where it is known, and the notes."""
-        parts = ["```sh\n" + "\n".join(self.command) + "\n```", markdown(self.columns, self.rows)]
+        parts = ["```sh\n" + "\n".join(self.command) + "\n```"] if self.command else []
+        parts.append(markdown(self.columns, self.rows))
         if self.commit != NOT_KNOWN:
             parts.append(f"*Commit: {self.commit}.*")
         if self.note:
