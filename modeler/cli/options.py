@@ -49,7 +49,7 @@ class ModelOptions:
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from the data")] = None
     """Side of a voxel of the model."""
     tolerance_mm: Annotated[
-        float | None, tyro.conf.arg(metavar="MM"), default("7.5 % of the object's size, at least twice the noise")
+        float | None, tyro.conf.arg(metavar="MM"), default("7.5 % of the object's size, at least 2.5 sd of the noise")
     ] = None
     """Error of the surface up to which the model serves its purpose; exit status 0 promises to keep it."""
 

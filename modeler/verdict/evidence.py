@@ -43,8 +43,8 @@ MAX_ABSENT: Final = 0.02
 captures; 0.04 for a box with a post of 3 cm in an upside-down pose."""
 TOLERANCE: Final = 0.075
 """Default tolerance on the surface, as a share of the object's size: 5 mm for a box of 15 x 20 x 14 cm."""
-TOLERANCE_SDS: Final = 2.0
-"""The least default tolerance, in standard deviations of the camera's range noise: a single image errs by that."""
+TOLERANCE_SDS: Final = 2.5
+"""The least default tolerance, in standard deviations of the camera's range noise, which one pixel in 80 exceeds."""
 WRONG_RAD: Final = np.radians(3.0)
 """Error above which a rotation is called wrong."""
 WRONG_SHARE: Final = 0.05
