@@ -14,7 +14,7 @@ import numpy.typing as npt
 from modeler.composition import compose
 from modeler.composition.compose import comes_back
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
-from modeler.export import RunFolder, RunMeta, alone
+from modeler.export import RunFolder, RunMeta, locked
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
@@ -152,7 +152,7 @@ def build(
     scene = compose.scene(modeler, frames)
     report: Mapping[str, Any] = {}
     last: Step | None = None
-    with alone(Path(out)):
+    with locked(Path(out)):
         folder = RunFolder.open(Path(out), overwrite=overwrite)
         facts = {"sequence": meta.sequence, "seed": seed, "prior": meta.prior}
         stream = open_stream(frames.name, save=folder.path / "recording.rrd", facts=facts)

@@ -105,7 +105,7 @@ def judged(closer: Closer, posteriors: Sequence[Posterior], map_view: MapView, *
 
 
 def witnessed(posterior: Posterior, nats: float) -> Posterior:
-    return replace(posterior, log_evidence=nats)
+    return replace(posterior, log_marginal_likelihood=nats)
 
 
 def told(source: int, *, scatter: float = 4.0, wrong: float = -90.0) -> Callable[[Posterior], Posterior]:

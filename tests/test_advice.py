@@ -34,15 +34,19 @@ def untrusted(
 @pytest.mark.parametrize(
     ("report", "prior", "options"),
     [
-        (untrusted("unsure_masks", "seen_through"), priors.GeneralPrior(), {"roi", "max_depth_m"}),
+        (untrusted("unsure_masks", "free_space_violations"), priors.GeneralPrior(), {"roi", "max_depth_m"}),
         (untrusted("no_motion"), priors.GeneralPrior(), {"roi", "max_depth_m"}),
-        (untrusted("seen_through", up=[0.0, -1.0, 0.0], turn_deg=25.0), priors.GeneralPrior(), {"prior": "table"}),
         (
-            untrusted("seen_through", up=[0.0, -1.0, 0.0], turn_deg=48.0),
+            untrusted("free_space_violations", up=[0.0, -1.0, 0.0], turn_deg=25.0),
+            priors.GeneralPrior(),
+            {"prior": "table"},
+        ),
+        (
+            untrusted("free_space_violations", up=[0.0, -1.0, 0.0], turn_deg=48.0),
             priors.GeneralPrior(),
             {"prior": "table", "max_rotation_deg": "100"},
         ),
-        (untrusted("seen_through"), priors.GeneralPrior(), {"prior": "turntable", "step_deg": "40"}),
+        (untrusted("free_space_violations"), priors.GeneralPrior(), {"prior": "turntable", "step_deg": "40"}),
         (untrusted("unsure_rotation", up=[0.0, -1.0, 0.0]), priors.TablePrior(), {"prior": "turntable"}),
         (
             untrusted("unsure_rotation", sigma_deg=15.0),
@@ -105,14 +109,14 @@ def test_a_turn_without_a_loop_tells_what_hangs_on_the_focal_length(
 
 @pytest.mark.parametrize(("closed", "first"), [(True, "modeler report"), (False, "")])
 def test_surface_that_is_not_there_leads_to_the_masks_where_a_loop_confirms_the_poses(closed: bool, first: str) -> None:
-    report = untrusted("seen_through", "absent", closed=closed, up=[0.0, -1.0, 0.0])
+    report = untrusted("free_space_violations", "false_surface", closed=closed, up=[0.0, -1.0, 0.0])
     (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith(first)
     assert bool(found.parameters) is not closed
 
 
 def test_a_size_that_is_not_known_has_a_remedy_of_its_own() -> None:
-    report = untrusted("absent", "unsure_size", closed=True)
+    report = untrusted("false_surface", "unsure_size", closed=True)
     masks, size = remedies(report, priors.GeneralPrior())
     assert masks.first.startswith("modeler report")
     assert "`known` focal-length" in size.first

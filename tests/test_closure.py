@@ -16,7 +16,7 @@ from modeler.types import (
     Degenerate,
     Failed,
     JoinsPrevious,
-    LowEvidence,
+    LowLikelihood,
     Mode,
     NotPlaced,
     OpenRotation,
@@ -238,8 +238,8 @@ def test_closure_that_the_images_contradict_is_refused_though_it_agrees() -> Non
     run.run(Closer(), told(13))
     (closure,) = [edge for edge in run.judged[13] if edge.target == 0]
     assert not closure.accepted
-    assert isinstance(closure.reason, LowEvidence)
-    assert closure.reason.log_evidence == -90.0
+    assert isinstance(closure.reason, LowLikelihood)
+    assert closure.reason.log_marginal_likelihood == -90.0
     assert -30.0 < closure.reason.median_nats <= -20.0
     taken = Run(list(REGULAR_DEG))
     taken.run(Closer(), told(13, wrong=-45.0))
@@ -400,7 +400,7 @@ def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contra
     map_view = MapView(run.views, solution, run.graph.edges)
     assert Closer().placement([doubtful], map_view, steps=1).base is doubtful
     assert Closer().placement([doubtful], map_view, steps=4).base is None
-    assert isinstance(judged(Closer(), [doubtful], map_view, steps=4)[0].reason, LowEvidence)
+    assert isinstance(judged(Closer(), [doubtful], map_view, steps=4)[0].reason, LowLikelihood)
     assert Closer().placement([witnessed(doubtful, -30.0)], map_view, steps=4).base is not None
 
 

@@ -178,8 +178,8 @@ def test_checks_tell_what_does_not_hold(tmp_path: Path) -> None:
     def is_absent() -> tuple[bool, str]:
         raise ImportError
 
-    assert Checks().attempt(refuses, "absent").failed == ("no such thing",)
-    assert Checks().attempt(is_absent, "absent").held == ("absent",)
+    assert Checks().attempt(refuses, "false_surface").failed == ("no such thing",)
+    assert Checks().attempt(is_absent, "false_surface").held == ("false_surface",)
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None
     rich = replace(
         step.edges_so_far[0].posterior,
         pareto_k=0.31,
-        log_evidence=-12.3,
+        log_marginal_likelihood=-12.3,
         seconds=0.1,
         outcome=Outcome.AMBIGUOUS,
     )

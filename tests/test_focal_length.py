@@ -107,7 +107,7 @@ def test_the_derivative_is_exact_and_what_it_does_not_tell_widens_the_posterior(
 
 def test_a_prior_that_knows_the_motion_keeps_it_under_every_focal_length(rng: np.random.Generator) -> None:
     class Exact(Free):
-        def log_evidence(self, target_from_source: Array) -> Array:
+        def log_prior(self, target_from_source: Array) -> Array:
             return gaussian(ABOUT, 0.1 * SIGMAS).log_density(target_from_source)
 
     by_focal = np.array([0.5, 0.0, 0.0, 0.0, 0.1, 0.0])

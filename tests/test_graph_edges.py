@@ -26,7 +26,7 @@ from modeler.types import (
     Mode,
     PoseGaussian,
     Solution,
-    loop_opening,
+    loop_closure_error,
     loops_closed,
 )
 from modeler.types.solution import Chains
@@ -115,7 +115,7 @@ def test_the_opening_of_a_loop_is_in_units_of_what_its_edges_state() -> None:
     squares = []
     for _ in range(300):
         graph, _ = ring(COUNT, rng, [(0, COUNT - 1)])
-        opening = loop_opening(graph.edges, Solution(), {})
+        opening = loop_closure_error(graph.edges, Solution(), {})
         assert opening is not None
         assert (opening.source, opening.target, opening.edges) == (COUNT - 1, 0, COUNT - 1)
         squares.append(opening.sigmas**2)
@@ -128,13 +128,13 @@ def test_the_opening_of_a_loop_is_what_a_closure_was_turned_by() -> None:
     exact = [edge(k, k + 1, PoseGaussian(_true(truth, k, k + 1), covariance(rng))) for k in range(COUNT - 1)]
     closure = edge(0, 7, PoseGaussian(_true(truth, 0, 7) @ spin([0.0, 0.1, 0.0]), covariance(rng)), "closure")
     centroid_m = {7: OBJECT_M}
-    opening = loop_opening([*exact, closure], Solution(), centroid_m)
+    opening = loop_closure_error([*exact, closure], Solution(), centroid_m)
     assert opening is not None
     assert opening.rotation_rad == pytest.approx(0.1)
     assert opening.translation_m == pytest.approx(0.0, abs=1e-9)
     refused = edge(0, 7, closure.posterior.pose, "closure", accepted=False)
-    assert loop_opening([*exact, refused], Solution(), centroid_m) is None
-    assert loop_opening([*exact[1:], closure], Solution(), centroid_m) is None, "no chain joins its ends"
+    assert loop_closure_error([*exact, refused], Solution(), centroid_m) is None
+    assert loop_closure_error([*exact[1:], closure], Solution(), centroid_m) is None, "no chain joins its ends"
 
 
 def test_motions_along_chains_are_those_composed_edge_by_edge() -> None:
@@ -176,8 +176,8 @@ HERE = np.eye(4)
 SURE = PoseGaussian(HERE, 1e-6 * np.eye(6))
 
 
-def of_evidence(of: Edge, log_evidence: float) -> Edge:
-    return replace(of, posterior=replace(of.posterior, log_evidence=log_evidence))
+def of_evidence(of: Edge, log_marginal_likelihood: float) -> Edge:
+    return replace(of, posterior=replace(of.posterior, log_marginal_likelihood=log_marginal_likelihood))
 
 
 def test_an_edge_takes_part_unless_it_was_refused_or_left_out() -> None:
@@ -212,14 +212,14 @@ def test_median_evidence_is_that_of_edges_that_take_part() -> None:
     good = [of_evidence(edge(k, k + 1, SURE), 100.0) for k in range(5)]
     lying = [of_evidence(edge(k, k + 1, SURE), -1000.0) for k in range(7)]
     left_out = Solution(outliers=tuple(lying))
-    assert Thresholds().evidence_bound([*good, *lying], left_out).median_nats == 100.0
-    assert not np.isfinite(Thresholds().evidence_bound(lying, left_out).median_nats)
+    assert Thresholds().likelihood_bound([*good, *lying], left_out).median_nats == 100.0
+    assert not np.isfinite(Thresholds().likelihood_bound(lying, left_out).median_nats)
 
 
 def test_spans_do_not_count_for_the_median_evidence_between_neighbours() -> None:
     good = [of_evidence(edge(k, k + 1, SURE), 100.0) for k in range(5)]
     wide = [of_evidence(edge(k, k + 2, SURE, "span"), 50.0) for k in range(9)]
-    assert Thresholds().evidence_bound([*good, *wide], Solution()).median_nats == 100.0
+    assert Thresholds().likelihood_bound([*good, *wide], Solution()).median_nats == 100.0
 
 
 def test_a_turntable_learns_nothing_from_edges_that_were_left_out() -> None:

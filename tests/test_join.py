@@ -16,7 +16,7 @@ import trimesh
 
 from modeler import se3
 from modeler.cli import main
-from modeler.export import RunFolder, RunMeta, alone, pose_file
+from modeler.export import RunFolder, RunMeta, locked, pose_file
 from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
 from modeler.runs.reopening import reopened
@@ -259,7 +259,7 @@ def test_nothing_is_joined_into_a_folder_that_another_program_writes_to(
     runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "joined"
-    with alone(out):
+    with locked(out):
         assert main(["join", str(runs[0]), str(runs[1]), "--out", str(out)]) == 2
     assert f"{out}: another run is writing to it" in capfd.readouterr().err
     assert not list(out.iterdir())

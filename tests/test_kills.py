@@ -17,7 +17,7 @@ import pytest
 
 from modeler.baselines import IcpRegistrar
 from modeler.cli import build, main
-from modeler.export import PairCache, Pairs, RunFolder, RunMeta, alone
+from modeler.export import PairCache, Pairs, RunFolder, RunMeta, locked
 from modeler.priors import GeneralPrior
 from modeler.sequences import bundled, open_sequence
 from modeler.types import AbstractPoseDensity, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
@@ -212,14 +212,14 @@ def test_ctrl_c_before_the_first_frame_ends_the_program(
 
 
 def test_two_runs_do_not_write_into_one_folder(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with alone(tmp_path / "run"):
+    with locked(tmp_path / "run"):
         for flag in ("--resume", "--overwrite"):
             assert main(["build", str(scene), "--out", str(tmp_path / "run"), *QUICK, flag]) == 2
             assert "another run is writing to it" in capsys.readouterr().err
-    with alone(tmp_path / "run"):
+    with locked(tmp_path / "run"):
         assert list((tmp_path / "run").iterdir()) == []
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="choose another place"), alone(tmp_path / "file"):
+    with pytest.raises(InputError, match="choose another place"), locked(tmp_path / "file"):
         pass
 
 
@@ -237,7 +237,7 @@ def posterior(rng: np.random.Generator) -> Posterior:
         modes=(Mode(0.75, gaussian), Mode(0.25, gaussian.inverse())),
         effective_samples=float("nan"),
         pareto_k=float("inf"),
-        log_evidence=-float("inf"),
+        log_marginal_likelihood=-float("inf"),
         seconds=0.1,
         least_overlap=0.35,
     )

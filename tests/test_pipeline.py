@@ -241,7 +241,7 @@ def test_a_frame_to_which_the_prior_does_not_apply_is_left_out() -> None:
     steps = run(FRAMES[:4], prior=AnyPrior(refused=frozenset({(2, 0), (2, 1), (2, 3)})))
     assert [step.left_out for step in steps] == [None, None, PriorRefused("frames 2 and 1: no plane"), None, None]
     assert [explain(edge.reason) for edge in steps[2].edges] == ["frames 2 and 1: no plane", "frames 2 and 0: no plane"]
-    assert {edge.posterior.outcome for edge in steps[2].edges} == {Outcome.NOT_KNOWN}
+    assert {edge.posterior.outcome for edge in steps[2].edges} == {Outcome.NOT_APPLICABLE}
 
 
 def test_a_closure_to_which_the_prior_does_not_apply_leaves_its_frame_in() -> None:

@@ -69,7 +69,7 @@ def near(poses: Array, log_density: Array) -> Gaussian:
 def test_samples_lie_in_the_support_and_repeat_under_a_seed(name: str) -> None:
     samples = drawn(name)[:500]
     assert np.isfinite(density_of(name).log_density(samples)).all()
-    assert np.isfinite(density_of(name).log_evidence(samples)).all()
+    assert np.isfinite(density_of(name).log_prior(samples)).all()
     again = CASES[name].density().sample(6000, np.random.default_rng(1))
     np.testing.assert_array_equal(drawn(name), again)
     np.testing.assert_allclose(np.linalg.det(samples[:, :3, :3]), 1.0)
@@ -139,7 +139,7 @@ def test_the_choice_of_camera_frame_does_not_matter(name: str) -> None:
 def test_evidence_is_all_of_the_density_or_what_is_known_without_the_guess(name: str) -> None:
     far = se3.exp(np.random.default_rng(0).normal(size=(500, 6)) * np.repeat([0.3, 0.03], 3)) @ truth(np.eye(4))
     poses = np.concatenate([drawn(name)[:500], far])
-    density, evidence = (of(poses) for of in (density_of(name).log_density, density_of(name).log_evidence))
+    density, evidence = (of(poses) for of in (density_of(name).log_density, density_of(name).log_prior))
     assert density_of(name).evidence is not CASES[name].proposes
     np.testing.assert_array_equal(np.isfinite(density), np.isfinite(evidence))
     if not CASES[name].proposes:
@@ -159,7 +159,7 @@ def test_evidence_is_all_of_the_density_or_what_is_known_without_the_guess(name:
 def test_a_guess_carries_no_information(name: str) -> None:
     """Weighted by evidence over density, samples of a guess are samples of what is known without it."""
     samples = drawn(name)
-    log_weights = density_of(name).log_evidence(samples) - density_of(name).log_density(samples)
+    log_weights = density_of(name).log_prior(samples) - density_of(name).log_density(samples)
     weights = np.exp(log_weights - log_weights.max())
     weights /= weights.sum()
     known = getattr(density_of(name), "known").sample(6000, np.random.default_rng(7))  # noqa: B009
@@ -181,7 +181,7 @@ def test_evidence_counts_once_and_guesses_not_at_all(name: str, variance: float)
     density = prior.between(SOURCE, TARGET)
     samples = density.sample(40_000, np.random.default_rng(8))
     turn_deg = np.degrees(se3.log(se3.inverse(truth(np.eye(4))) @ samples)[:, 0])
-    log_weights = density.log_evidence(samples) - density.log_density(samples) - 0.5 * (turn_deg / sigma_deg) ** 2
+    log_weights = density.log_prior(samples) - density.log_density(samples) - 0.5 * (turn_deg / sigma_deg) ** 2
     weights = np.exp(log_weights - log_weights.max())
     weights /= weights.sum()
     found = weights @ (turn_deg - weights @ turn_deg) ** 2

@@ -203,7 +203,7 @@ def test_what_is_learnt_tells_where_to_look_and_is_no_evidence(rng: np.random.Ge
     taught = prior.learned(solution(HERE), edges(HERE))
     before, after = (which.between(BARE_SOURCE, BARE_TARGET) for which in (prior, taught))
     samples = after.sample(1000, rng)
-    np.testing.assert_allclose(after.log_evidence(samples), before.log_density(samples))
+    np.testing.assert_allclose(after.log_prior(samples), before.log_density(samples))
     pose = truth(HERE)[None]
     assert after.log_density(pose) > before.log_density(pose) + 3.0
 
@@ -225,7 +225,7 @@ def test_which_way_round_is_learnt_tells_where_to_look_and_is_no_evidence(rng: n
     prior = TurntablePrior(24.0, 2.0, step_sign="unknown")
     before, after = (p.between(SOURCE, TARGET) for p in (prior, replace(prior, sense=1)))
     samples = before.sample(1000, rng)
-    np.testing.assert_allclose(after.log_evidence(samples), before.log_density(samples))
+    np.testing.assert_allclose(after.log_prior(samples), before.log_density(samples))
     assert after.log_density(truth(HERE)[None]) > before.log_density(truth(HERE)[None]) + 0.3
     assert not after.evidence
 
@@ -268,17 +268,17 @@ def test_steps_count_once_however_many_edges_follow_from_them(prior: TurntablePr
     taught = prior.learned(solution(HERE, 3), ())
     samples = prior.between(SOURCE, TARGET).sample(300, np.random.default_rng(RNG))
     np.testing.assert_allclose(
-        taught.between(SOURCE, TARGET).log_evidence(samples), prior.between(SOURCE, TARGET).log_evidence(samples)
+        taught.between(SOURCE, TARGET).log_prior(samples), prior.between(SOURCE, TARGET).log_prior(samples)
     )
     earlier = taught.between(SOURCE, at(1, TARGET))
     assert isinstance(earlier, DefensiveMixture)
-    evidence = earlier.log_evidence(earlier.known.sample(300, np.random.default_rng(RNG)))
+    evidence = earlier.log_prior(earlier.known.sample(300, np.random.default_rng(RNG)))
     assert np.isfinite(evidence).all()
     assert earlier.known.sample(1, np.random.default_rng(0)).shape == (1, 4, 4)
     assert not isinstance(earlier.known, DefensiveMixture)
     placed = taught.following(1).between(SOURCE, at(1, TARGET))  # a frame that was skipped, or lost and found again
     first = prior.between(SOURCE, at(1, TARGET))
-    np.testing.assert_allclose(placed.log_evidence(samples), first.log_evidence(samples))
+    np.testing.assert_allclose(placed.log_prior(samples), first.log_prior(samples))
 
 
 # A robot's hand
@@ -311,7 +311,7 @@ def test_a_hand_that_takes_the_object_anew_tells_nothing_of_its_motion(steps: fl
     without = GeneralPrior().relaxed(steps).between(SOURCE, TARGET)
     pose = truth(HERE)[None]
     expected = np.log(grasp_changed) + without.log_density(pose)
-    np.testing.assert_allclose(density.log_evidence(pose), expected, atol=1e-3)
+    np.testing.assert_allclose(density.log_prior(pose), expected, atol=1e-3)
     apart = se3.rotation_angle(se3.inverse(truth(HERE)) @ density.sample(2000, np.random.default_rng(RNG)))
     assert np.mean(apart < np.radians(90.0)) == pytest.approx(0.5, abs=0.05)  # the search looks at both
 
@@ -320,8 +320,8 @@ def test_a_new_grasp_may_turn_the_object_in_any_way_where_limits_are_assumed() -
     unlimited = held(HERE).unlimited()
     assert unlimited is not None
     over = turned(np.radians(170.0))[None]
-    assert unlimited.between(SOURCE, TARGET).log_evidence(over) > -10.0
-    assert held(HERE).between(SOURCE, TARGET).log_evidence(over) < -100.0
+    assert unlimited.between(SOURCE, TARGET).log_prior(over) > -10.0
+    assert held(HERE).between(SOURCE, TARGET).log_prior(over) < -100.0
     assert replace(held(HERE), regrasped=GeneralPrior(40.0)).unlimited() is None
 
 
@@ -347,7 +347,7 @@ def test_a_hand_that_turned_far_leaves_room_for_what_is_seen(steps: int) -> None
     true = poses[0] @ se3.inverse(poses[steps])
     apart_m = np.linalg.norm(se3.transform(true, source.centroid_m[None])[0] - target.centroid_m)
     assert (apart_m > 0.04) == (steps > 1)
-    assert np.isfinite(prior.between(source, target).log_evidence(true[None]))
+    assert np.isfinite(prior.between(source, target).log_prior(true[None]))
 
 
 def test_a_hand_whose_prior_grows_leaves_more_room() -> None:

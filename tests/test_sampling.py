@@ -82,7 +82,7 @@ def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
     np.testing.assert_allclose(covariance / np.outer(product, product), np.eye(6), atol=0.12)
     both = np.hypot(SIGMAS, narrower * SIGMAS)
     evidence = -0.5 * np.sum((shift / both) ** 2) - np.sum(np.log(both)) - 3.0 * np.log(2.0 * np.pi)
-    assert found.log_evidence == pytest.approx(evidence, abs=0.05)
+    assert found.log_marginal_likelihood == pytest.approx(evidence, abs=0.05)
     assert found.pareto_k < 0.5
 
 
@@ -131,7 +131,7 @@ def test_it_draws_no_more_than_it_may_and_states_its_effective_size() -> None:
 
 def test_the_likelihood_is_called_only_inside_the_support_and_an_empty_support_is_no_evidence() -> None:
     class Nowhere(Around):
-        def log_evidence(self, target_from_source: Array) -> Array:
+        def log_prior(self, target_from_source: Array) -> Array:
             return np.full(len(target_from_source), -np.inf)
 
     def never(poses: Array, _: Array) -> Array:
@@ -140,7 +140,7 @@ def test_the_likelihood_is_called_only_inside_the_support_and_an_empty_support_i
     found = AdaptiveSampler(max_draws=600).run(
         Nowhere(SIGMAS, evidence=False), never, CENTRE_M, np.random.default_rng(0)
     )
-    assert found.log_evidence == -np.inf
+    assert found.log_marginal_likelihood == -np.inf
     assert np.all(np.isfinite(found.weights))
 
 
@@ -175,9 +175,11 @@ def turned(angle_rad):
     return se3.exp(np.array([angle_rad, 0, 0, 0, 0, 0]))
 
 
-def mode(poses, log_evidence):
+def mode(poses, log_marginal_likelihood):
     """Samples of equal weight."""
-    return WeightedSamples(poses, np.full(len(poses), 1.0 / len(poses)), np.zeros(len(poses)), log_evidence, 0.1)
+    return WeightedSamples(
+        poses, np.full(len(poses), 1.0 / len(poses)), np.zeros(len(poses)), log_marginal_likelihood, 0.1
+    )
 
 
 def test_modes_are_weighed_and_those_of_no_weight_dropped(rng):
@@ -239,7 +241,7 @@ def test_a_narrow_component_has_the_gaussian_density(rng):
 def test_a_mixture_only_proposes(rng):
     density = mixture(rng)
     samples = density.sample(200, rng)
-    np.testing.assert_array_equal(density.log_evidence(samples), density.known.log_density(samples))
+    np.testing.assert_array_equal(density.log_prior(samples), density.known.log_density(samples))
 
 
 def test_a_narrow_peak_on_a_broad_ridge_is_separated_by_expectation_maximisation(rng: np.random.Generator) -> None:

@@ -103,7 +103,7 @@ def registered(
     angle_deg: float, outcome: Outcome = Outcome.CONVERGED, nats: float = -20.0, overlap: float = 0.8
 ) -> Posterior:
     pose = PoseGaussian(turned(angle_deg), COVARIANCE)
-    return Posterior(1, 0, pose, outcome, overlap, least_overlap=0.35, log_evidence=nats, seconds=1.0)
+    return Posterior(1, 0, pose, outcome, overlap, least_overlap=0.35, log_marginal_likelihood=nats, seconds=1.0)
 
 
 def placed(registrar: AbstractRegistrar, prior: Limits) -> Posterior:
@@ -206,7 +206,9 @@ def of_modes(*modes: tuple[float, float]) -> Posterior:
     poses = [turned(deg) for _, deg in modes]
     told = tuple(Mode(weight, PoseGaussian(pose, COVARIANCE)) for (weight, _), pose in zip(modes, poses, strict=True))
     shares = np.array([weight for weight, _ in modes])
-    return Posterior(1, 0, pooled(told), Outcome.AMBIGUOUS, 0.8, np.stack(poses), shares, told, log_evidence=-20.0)
+    return Posterior(
+        1, 0, pooled(told), Outcome.AMBIGUOUS, 0.8, np.stack(poses), shares, told, log_marginal_likelihood=-20.0
+    )
 
 
 def test_modes_beyond_the_limits_count_as_little_as_motions_beyond_do() -> None:

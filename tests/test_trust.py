@@ -53,7 +53,7 @@ def spoilt(out: Path, order: Sequence[int], change: Callable[[Matrix], Matrix] =
     [
         (range(14), list, ("--prior", "table"), set()),
         ([0] * 10, list, ("--prior", "turntable", "--step-deg", "25"), {"no_motion", "prior_contradicted"}),
-        (SHUFFLED, list, ("--prior", "table"), {"seen_through"}),
+        (SHUFFLED, list, ("--prior", "table"), {"free_space_violations"}),
         (range(14), scaled(0.94), ("--prior", "table"), {"loop_open"}),
         (range(14), scaled(1.06), ("--prior", "table"), {"loop_open"}),
         (range(14), exchanged, ("--prior", "table"), {"prior_contradicted"}),

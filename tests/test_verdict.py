@@ -36,7 +36,7 @@ from modeler.types import (
     Solution,
     Stated,
     Step,
-    loop_openings,
+    loop_closure_errors,
 )
 from modeler.verdict import judged
 from modeler.verdict.evidence import (
@@ -115,14 +115,14 @@ def test_other_frames_see_through_what_is_in_the_wrong_place() -> None:
     views = views_of(angles_deg)
     found = free_space(views, poses_of(angles_deg), 0.005)
     assert found is not None
-    assert found.seen_through.holds
-    assert found.seen_through.value < 0.01
-    assert found.absent.holds
-    assert found.absent.value == 0.0
+    assert found.violations.holds
+    assert found.violations.value < 0.01
+    assert found.false_surface.holds
+    assert found.false_surface.value == 0.0
     wrong = free_space(views, poses_of([*angles_deg[:5], 125.0 - 60.0]), 0.005)
     assert wrong is not None
     assert wrong.frame == 5
-    assert not wrong.seen_through.holds
+    assert not wrong.violations.holds
     assert free_space({0: views[0]}, poses_of([0.0]), 0.005) is None  # nobody else looks
 
 
@@ -134,8 +134,8 @@ def test_a_part_that_one_frame_alone_shows_is_not_there() -> None:
     found = free_space(views | {2: longer}, poses, 0.005)
     assert found is not None
     assert found.contradicted_frame == 2
-    assert not found.absent.holds
-    assert free_space(views, poses, 0.005).absent.holds  # pyright: ignore[reportOptionalMemberAccess]
+    assert not found.false_surface.holds
+    assert free_space(views, poses, 0.005).false_surface.holds  # pyright: ignore[reportOptionalMemberAccess]
 
 
 @pytest.mark.parametrize(("sigma", "codes"), [(0.0, []), (0.04, []), (0.12, ["unsure_size"])])
@@ -251,17 +251,17 @@ def test_loops_open_by_more_than_their_edges_state_speak_against_a_model() -> No
     """Fifteen edges of 0.3° each: a loop is uncertain by 1.2°."""
     for off_deg, holds in ((0.0, True), (2.0, True), (8.0, False)):
         edges, solution = ring(off_deg)
-        worst = loop_check(loop_openings(edges, solution, {}))
+        worst = loop_check(loop_closure_errors(edges, solution, {}))
         assert worst is not None
         opening, check = worst
         assert check.holds is holds
         assert np.degrees(opening.rotation_rad) == pytest.approx(off_deg, abs=1e-6)
-    assert loop_check(loop_openings(edges[:-1], solution, {})) is None
+    assert loop_check(loop_closure_errors(edges[:-1], solution, {})) is None
 
 
 def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
     edges, solution = ring(2.0)
-    openings = loop_openings(edges, solution, {})
+    openings = loop_closure_errors(edges, solution, {})
     one, many = loop_check(openings), loop_check(openings * 50)
     assert one is not None
     assert many is not None
@@ -401,8 +401,8 @@ def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:
             "motion_m",
             "prior_sds",
             "prior_chi2",
-            "seen_through",
-            "absent",
+            "free_space_violations",
+            "false_surface",
             "other_modes",
             "pose_sd_deg",
             "pose_sd_m",

@@ -13,7 +13,7 @@ from rerun_recordings import Recording, drawn
 from turning_box import CENTRE_M, COUNT, COVARIANCE, HALF_M, LOST, object_from_camera
 
 from modeler import se3
-from modeler.types import Mode, Plane, PoseGaussian, Step, loop_opening
+from modeler.types import Mode, Plane, PoseGaussian, Step, loop_closure_error
 from modeler.viz import entities, images, pair_view, readings
 
 
@@ -188,7 +188,7 @@ def test_every_pair_is_put_into_words(run: list[Step], recording: Recording) -> 
 def test_the_last_words_tell_by_how_much_the_loop_was_open(run: list[Step], recording: Recording) -> None:
     last = run[-1]
     centroids_m = {frame: view.centroid_m for frame, view in last.views.items()}
-    opening = loop_opening(last.edges_so_far, last.solution, centroids_m)
+    opening = loop_closure_error(last.edges_so_far, last.solution, centroids_m)
     assert opening is not None
     opened = f"{np.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm"
     assert f"has a closure error of {opened}" in recording[entities.NOW][last.frame.index]["text"][0]

@@ -11,7 +11,7 @@ import rerun as rr
 
 from modeler import se3
 from modeler.export.report import undetermined
-from modeler.types import ACCEPTED, Array, Edge, PoseGaussian, Posterior, Step, explain, loop_opening
+from modeler.types import ACCEPTED, Array, Edge, PoseGaussian, Posterior, Step, explain, loop_closure_error
 from modeler.viz import entities
 from modeler.viz.drawings import Drawing
 
@@ -173,8 +173,8 @@ def now_words(step: Step) -> str:
 def loop_words(step: Step) -> list[str]:
     """Return in words the loop closure error before the optimisation; nothing without a loop."""
     centroids_m = {frame: view.centroid_m for frame, view in step.views.items()}
-    opening = loop_opening(step.edges_so_far, step.solution, centroids_m)
-    return [] if opening is None or not math.isfinite(opening.sigmas) else [opening.words]
+    error = loop_closure_error(step.edges_so_far, step.solution, centroids_m)
+    return [] if error is None or not math.isfinite(error.sigmas) else [error.words]
 
 
 def _readings(posterior: Posterior, step: Step) -> dict[str, float]:

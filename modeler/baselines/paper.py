@@ -90,7 +90,7 @@ class PaperRegistrar(AbstractRegistrar):
             weights=weights / weights.sum(),
             effective_samples=effective,
             pareto_k=pareto_tail(log_weights),
-            log_evidence=float(log_weights.max() + np.log(weights.sum() / drawn)),
+            log_marginal_likelihood=float(log_weights.max() + np.log(weights.sum() / drawn)),
             seconds=time.perf_counter() - started,
         )
 
@@ -147,11 +147,11 @@ class PaperRegistrar(AbstractRegistrar):
 
 
 def _log_correction(density: AbstractPoseDensity, poses: Array) -> Array | float:
-    """Return log evidence minus log density (n,) at poses (n, 12) drawn from a density: 0 unless it is a proposal."""
+    """Return log prior minus log density (n,) at poses (n, 12) drawn from a density: 0 unless it is a proposal."""
     if density.evidence:
         return 0.0
     drawn = matrices(poses)
-    return density.log_evidence(drawn) - density.log_density(drawn)
+    return density.log_prior(drawn) - density.log_density(drawn)
 
 
 def noise(view: RayImage) -> Array:

@@ -72,7 +72,7 @@ class Batch:
         from modeler.batch.jobs import ended, read_note, standing
         from modeler.batch.models import write_models
         from modeler.batch.work import results
-        from modeler.export import alone
+        from modeler.export import locked
         from modeler.runs.compiling import compile_kernels
         from modeler.runs.outputs import check_folder
         from modeler.types import InputError
@@ -81,7 +81,7 @@ class Batch:
             raise InputError(f"--workers {self.workers} is out of range; give a whole number from 1")
         check_engine(self.executor)
         check_folder(self.out, self.sequences)
-        with alone(self.out):
+        with locked(self.out):
             jobs = _jobs(self)
             check_folder(self.out, [Path(job.sequence) for job in jobs])
             stands = {job: standing(job) for job in jobs}

@@ -71,7 +71,7 @@ class Build:
             InputError: if the input or the folder cannot be used.
         """
         from modeler.composition import compose
-        from modeler.export import PairCache, RunFolder, RunMeta, alone
+        from modeler.export import PairCache, RunFolder, RunMeta, locked
         from modeler.runs.outputs import check_run_folder
         from modeler.runs.reopening import estimated_camera
         from modeler.system.concurrency import in_parallel
@@ -102,7 +102,7 @@ class Build:
             say(f"{', '.join(changes)} since the run: frames are registered with them, from what is kept of it")
         compile_kernels(say)
         scene, _ = in_parallel(partial(compose.scene, modeler, whole), load)
-        with alone(self.out):
+        with locked(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
             folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)
             modeler = replace(modeler, cache=PairCache(folder.pairs, meta.versions))
@@ -305,11 +305,11 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
     took = f"{report['seconds'].get('total', 0.0):.0f} s"
     frames = "1 frame" if len(report["frames"]) == 1 else f"{len(report['frames'])} frames"
     say(f"{accepted} of {frames}, {loop}, {took}: {options.out}")
-    if opening := report.get("loop"):
+    if error := report.get("loop"):
         say(
-            f"loop closure error before optimisation: {opening['opening_deg']:.1f}° and "
-            f"{1000.0 * opening['opening_m']:.1f} mm, "
-            f"{opening['sigmas']:.1f} standard deviations of {opening['edges']} edges and the closure"
+            f"loop closure error before optimisation: {error['opening_deg']:.1f}° and "
+            f"{1000.0 * error['opening_m']:.1f} mm, "
+            f"{error['sigmas']:.1f} standard deviations of {error['edges']} edges and the closure"
         )
     if (camera := report.get("camera")) and (words := estimated_focal_length(camera)):
         say(words)

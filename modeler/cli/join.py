@@ -60,7 +60,7 @@ def _check(options: Join) -> None:
     Raises:
         InputError: if they are such, or another program is writing to the folder.
     """
-    from modeler.export import alone
+    from modeler.export import locked
     from modeler.runs.outputs import check_run_folder, run_inputs
     from modeler.types import InputError
 
@@ -70,5 +70,5 @@ def _check(options: Join) -> None:
         raise InputError(f"RUN_A and RUN_B are both {options.run_a}; name two runs")
     check_run_folder(options.out, run_inputs([options.run_a, options.run_b]), overwrite=options.overwrite)
     if options.out.is_dir():
-        with alone(options.out):  # asked now, not only when the work is done
+        with locked(options.out):  # asked now, not only when the work is done
             pass

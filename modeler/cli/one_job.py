@@ -49,9 +49,9 @@ def begin(words: str) -> tuple[Job, dict[str, Any]]:
     before = read_note(job.note)
     now = standing(job, before)
     if now == "changed":
-        from modeler.export import RunFolder, alone
+        from modeler.export import RunFolder, locked
 
-        with alone(job.run):
+        with locked(job.run):
             RunFolder.open(job.run, overwrite=True)
     note = {
         "sequence": job.sequence,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, failure, modes
+from modeler.closure.consistency import ConsistencyModel, LikelihoodBound, Thresholds, failure, modes
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.closure.relocaliser import Placement, Relocaliser
@@ -222,8 +222,8 @@ class Closer:
     def _came_back(self, posterior: Posterior, map_view: MapView, paths: ShortestPaths) -> bool:
         return map_view.came_back(posterior.target, posterior.source, paths, away_deg=self.away_deg)
 
-    def _evidence(self, map_view: MapView) -> EvidenceBound:
-        return self.thresholds.evidence_bound(map_view.edges, map_view.solution)
+    def _evidence(self, map_view: MapView) -> LikelihoodBound:
+        return self.thresholds.likelihood_bound(map_view.edges, map_view.solution)
 
-    def _relocaliser(self, map_view: MapView, evidence: EvidenceBound, *, steps: int = 1) -> Relocaliser:
+    def _relocaliser(self, map_view: MapView, evidence: LikelihoodBound, *, steps: int = 1) -> Relocaliser:
         return Relocaliser(map_view, self.thresholds, evidence, self.consistency, self.max_angle_deg, steps)

@@ -17,7 +17,7 @@ from modeler.types import (
     Degenerate,
     Edge,
     Failed,
-    LowEvidence,
+    LowLikelihood,
     LowOverlap,
     OpenRotation,
     Outcome,
@@ -34,10 +34,10 @@ class Thresholds:
 
     min_overlap: float = 0.4
     """Least overlap (0..1), predicted and measured."""
-    max_evidence_drop_nats: float = 40.0
-    """Largest difference of the log evidence from the median of the run's edges. Right edges of four captures are up to
-    29 nats below it, wrong ones from 3 above to 32 below: what is refused matches next to nothing."""
-    max_evidence_drop_sigmas: float = 8.0
+    max_likelihood_drop_nats: float = 40.0
+    """Largest difference of the log marginal likelihood from the median of the run's edges. Right edges of captures are
+    up to 29 nats below it, wrong ones from 3 above to 32 below: what is refused matches next to nothing."""
+    max_likelihood_drop_sigmas: float = 8.0
     """The same in robust standard deviations of the run's edges; the larger of both is used."""
     min_edges: int = 5
     """Least number of edges for a median."""
@@ -51,30 +51,30 @@ class Thresholds:
     """Largest standard deviation of such a rotation in degrees. The cosine of it is 0.87: a Gaussian about one mean is
     then wrong about the other axes, of which it is sure."""
 
-    def evidence_bound(self, edges: Sequence[Edge], solution: Solution) -> EvidenceBound:
-        """Return the least log evidence of further edges, from a run's edges between neighbours so far.
+    def likelihood_bound(self, edges: Sequence[Edge], solution: Solution) -> LikelihoodBound:
+        """Return the least log marginal likelihood of further edges, from a run's edges between neighbours so far.
 
         Log evidence depends on shape and sensor and is meaningful only in comparison; that of a wrong pose is far below
         the scatter of the run's edges.
         """
         joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
-        all_nats = [edge.posterior.log_evidence for edge in islice(joining, RECENT_EDGES)]
+        all_nats = [edge.posterior.log_marginal_likelihood for edge in islice(joining, RECENT_EDGES)]
         nats = np.array([evidence for evidence in all_nats if np.isfinite(evidence)])
         if len(nats) < self.min_edges:
-            return EvidenceBound()
+            return LikelihoodBound()
         median = float(np.median(nats))
         scatter = 1.4826 * float(np.median(np.abs(nats - median)))
-        drop_nats = max(self.max_evidence_drop_nats, self.max_evidence_drop_sigmas * scatter)  # method, eq. 9.5
-        return EvidenceBound(median, median - drop_nats)
+        drop_nats = max(self.max_likelihood_drop_nats, self.max_likelihood_drop_sigmas * scatter)  # method, eq. 9.5
+        return LikelihoodBound(median, median - drop_nats)
 
-    def defect(self, posterior: Posterior, evidence: EvidenceBound) -> Reason | None:
+    def defect(self, posterior: Posterior, evidence: LikelihoodBound) -> Reason | None:
         """Return why a posterior is rejected independently of the other edges; None if it is not."""
         if (found := failure(posterior)) is not None:
             return found
         if not posterior.overlap >= self.min_overlap:
             return LowOverlap(posterior.overlap, self.min_overlap)
-        if posterior.log_evidence < evidence.min_nats:
-            return LowEvidence(posterior.log_evidence, evidence.median_nats)
+        if posterior.log_marginal_likelihood < evidence.min_nats:
+            return LowLikelihood(posterior.log_marginal_likelihood, evidence.median_nats)
         return None
 
     def open_rotation(self, posterior: Posterior, predicted: PoseGaussian) -> OpenRotation | None:
@@ -86,14 +86,14 @@ class Thresholds:
             return None
         return OpenRotation(float(np.degrees(sigma_rad)))
 
-    def places_alone(self, posterior: Posterior, evidence: EvidenceBound) -> bool:
+    def places_alone(self, posterior: Posterior, evidence: LikelihoodBound) -> bool:
         """Return whether a registration may place a frame without that of the previous view."""
         return posterior.outcome is Outcome.CONVERGED and self.defect(posterior, evidence) is None
 
 
 @dataclass(frozen=True)
-class EvidenceBound:
-    """The log evidence of a run's edges, and the least of further ones."""
+class LikelihoodBound:
+    """The log marginal likelihood of a run's edges, and the least of further ones."""
 
     median_nats: float = float("nan")
     """Median of the run's edges; NaN: not known yet."""

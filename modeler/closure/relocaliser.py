@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import ConsistencyModel, EvidenceBound, Thresholds, failure, modes
+from modeler.closure.consistency import ConsistencyModel, LikelihoodBound, Thresholds, failure, modes
 from modeler.closure.map_view import MapView
 from modeler.types import ConfirmedBy, JoinsPrevious, NearExtrapolation, NotPlaced, Posterior, Reason, Relocalised
 
@@ -36,7 +36,7 @@ class Relocaliser:
     """The map so far."""
     thresholds: Thresholds
     """Requirements on registrations."""
-    evidence: EvidenceBound
+    evidence: LikelihoodBound
     """Bound from the run's edges."""
     consistency: ConsistencyModel
     """Test of registrations against each other."""
@@ -99,7 +99,7 @@ class Relocaliser:
 
     def _continues(self, odometry: Posterior) -> bool:
         """Return whether the previous view's registration is valid and, after lost frames, has enough evidence."""
-        matches = self.steps == 1 or not odometry.log_evidence < self.evidence.min_nats
+        matches = self.steps == 1 or not odometry.log_marginal_likelihood < self.evidence.min_nats
         return failure(odometry) is None and matches
 
     def _confirmation(self, posterior: Posterior, candidates: Sequence[Posterior]) -> ConfirmedBy | None:

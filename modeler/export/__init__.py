@@ -2,7 +2,7 @@
 
 from modeler.export.bop import scene_gt_info as scene_gt_info
 from modeler.export.bop import write_bop as write_bop
-from modeler.export.files import alone as alone
+from modeler.export.files import locked as locked
 from modeler.export.files import write_atomically as write_atomically
 from modeler.export.formats import g2o_text as g2o_text
 from modeler.export.formats import tum_text as tum_text

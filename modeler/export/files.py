@@ -79,7 +79,7 @@ def settle_soon(*paths: Path) -> threading.Thread:
 
 
 @contextlib.contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Make a folder, if it is not there, and keep other programs that ask for the same out of it.
 
     Raises:

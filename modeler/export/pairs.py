@@ -165,7 +165,7 @@ def _key(inputs: Sequence[object], views: Sequence[RayImage], density: AbstractP
             _digests[view] = _digest(view)
         digest.update(_digests[view])
     drawn = density.sample(_DRAWN, np.random.default_rng(0))
-    for numbers in (drawn, density.log_density(drawn), density.log_evidence(drawn)):
+    for numbers in (drawn, density.log_density(drawn), density.log_prior(drawn)):
         digest.update(np.ascontiguousarray(numbers).tobytes())
     return digest.hexdigest()
 

@@ -94,7 +94,7 @@ def _posterior(edge: Mapping[str, Any]) -> Posterior:
         overlap=_number(edge["overlap"]),
         effective_samples=_number(edge["effective_samples"]),
         pareto_k=_number(edge["pareto_k"]),
-        log_evidence=_number(edge["log_evidence"]),
+        log_marginal_likelihood=_number(edge["log_evidence"]),
         seconds=_number(edge["seconds"]),
     )
 

@@ -23,7 +23,7 @@ from modeler.types import (
     Solution,
     Step,
     explain,
-    loop_opening,
+    loop_closure_error,
     loops_closed,
 )
 from modeler.verdict import judged
@@ -151,15 +151,15 @@ def _loop(
     edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage]
 ) -> dict[str, float | int | list[int]] | None:
     """Return by how much the chain of consecutive edges missed the closure that spans most of it; None without one."""
-    opening = loop_opening(edges, solution, {frame: view.centroid_m for frame, view in views.items()})
-    if opening is None or not math.isfinite(opening.sigmas):
+    error = loop_closure_error(edges, solution, {frame: view.centroid_m for frame, view in views.items()})
+    if error is None or not math.isfinite(error.sigmas):
         return None
     return {
-        "frames": [opening.target, opening.source],
-        "edges": opening.edges,
-        "opening_deg": float(np.degrees(opening.rotation_rad)),
-        "opening_m": opening.translation_m,
-        "sigmas": opening.sigmas,
+        "frames": [error.target, error.source],
+        "edges": error.edges,
+        "opening_deg": float(np.degrees(error.rotation_rad)),
+        "opening_m": error.translation_m,
+        "sigmas": error.sigmas,
     }
 
 
@@ -208,7 +208,7 @@ def edge_record(
         ],
         "effective_samples": posterior.effective_samples,
         "pareto_k": posterior.pareto_k,
-        "log_evidence": posterior.log_evidence,
+        "log_evidence": posterior.log_marginal_likelihood,
         "overlap": posterior.overlap,
         "seconds": posterior.seconds,
     }

@@ -280,7 +280,7 @@ def unless_alike(within: Posterior, wider: Posterior, density: AbstractPoseDensi
         separate = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > _SEPARATE_RAD
         # Only for one mode: the mean of several may lie inside without being near any of them.
         inside = wider.outcome is Outcome.CONVERGED and _inside(density, wider.pose.mean[None])[0]
-        better_nats = wider.log_evidence - within.log_evidence
+        better_nats = wider.log_marginal_likelihood - within.log_marginal_likelihood
         similar_overlap = wider.overlap < within.overlap + _MIN_OVERLAP_GAIN
         if separate and not inside and similar_overlap and better_nats < _BEYOND_LIMITS_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)

@@ -105,7 +105,7 @@ class Tracker:
         """Return edges, with the reason for those to which the prior does not apply."""
         return tuple(
             replace(edge, reason=self.refusals.get((edge.source, edge.target), edge.reason))
-            if edge.posterior.outcome is Outcome.NOT_KNOWN
+            if edge.posterior.outcome is Outcome.NOT_APPLICABLE
             else edge
             for edge in edges
         )
@@ -127,11 +127,11 @@ class Tracker:
         return Search(self.state, self.learned_prior, self.closer, view, first, least_effort)
 
     def _registered(self, attempt: Attempt) -> Posterior:
-        """Return the posterior of an attempt; its outcome is `NOT_KNOWN` if the prior does not apply."""
+        """Return the posterior of an attempt; its outcome is `NOT_APPLICABLE` if the prior does not apply."""
         source, target = self.ready(attempt.source), self.ready(self.state.views[attempt.target])
         try:
             density = attempt.prior.between(source, target)
         except InputError as error:
             self.refusals[source.index, target.index] = PriorRefused(str(error))
-            return failed(source, target, Outcome.NOT_KNOWN)
+            return failed(source, target, Outcome.NOT_APPLICABLE)
         return self.registrations.register(source, target, density, effort=attempt.effort)

@@ -231,7 +231,7 @@ class Alternatives(AbstractPoseDensity):
 class DefensiveMixture(AbstractPoseDensity):
     """A mixture of proposals and independent knowledge within the latter's support; only the latter is evidence.
 
-    Importance weights `exp(log_evidence - log_density)` divide the proposals out. The fraction of the independent
+    Importance weights `exp(log_prior - log_density)` divide the proposals out. The fraction of the independent
     knowledge bounds those weights, however wrong the proposals are (Hesterberg 1995).
     """
 
@@ -273,9 +273,9 @@ class DefensiveMixture(AbstractPoseDensity):
         total[fits] = mixed
         return total
 
-    def log_evidence(self, target_from_source: Array) -> Array:
+    def log_prior(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of the independent knowledge at poses (n, 4, 4)."""
-        return self.known.log_evidence(target_from_source)
+        return self.known.log_prior(target_from_source)
 
 
 def defensive_mixture(

@@ -107,9 +107,9 @@ class Product(AbstractPoseDensity):
             self.first.log_density(target_from_source) + self.second.log_density(target_from_source) - self.log_volume
         )
 
-    def log_evidence(self, target_from_source: Array) -> Array:
+    def log_prior(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of the independent knowledge of both at poses (n, 4, 4)."""
-        known = self.first.log_evidence(target_from_source) + self.second.log_evidence(target_from_source)
+        known = self.first.log_prior(target_from_source) + self.second.log_prior(target_from_source)
         return known - self.log_volume if self.evidence else known
 
 

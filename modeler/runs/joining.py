@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from modeler.export import RunFolder, RunMeta, alone
+from modeler.export import RunFolder, RunMeta, locked
 from modeler.fusion import Fuser, conditional_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline.joining import Alignment, Joiner, Segment
@@ -74,7 +74,7 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
         settings={"joined": [str(run.absolute()) for run in (run_a, run_b)], "offset": offset, "pairs": pairs},
         camera=_least_known([*first.parts, *second.parts]),
     )
-    with alone(out):
+    with locked(out):
         folder = RunFolder.open(out, overwrite=overwrite)
         report, verdict = _written(folder, (first, second), graph, solve(graph, guess), meta, began_s=began_s)
         folder.finish()

@@ -33,7 +33,7 @@ from modeler.types.reasons import ElsewhereThanSegments as ElsewhereThanSegments
 from modeler.types.reasons import Failed as Failed
 from modeler.types.reasons import JoinsPrevious as JoinsPrevious
 from modeler.types.reasons import JoinsSegments as JoinsSegments
-from modeler.types.reasons import LowEvidence as LowEvidence
+from modeler.types.reasons import LowLikelihood as LowLikelihood
 from modeler.types.reasons import LowOverlap as LowOverlap
 from modeler.types.reasons import NearExtrapolation as NearExtrapolation
 from modeler.types.reasons import NotJoined as NotJoined
@@ -53,11 +53,11 @@ from modeler.types.solution import NEAR_DEG as NEAR_DEG
 from modeler.types.solution import Edge as Edge
 from modeler.types.solution import EdgeKind as EdgeKind
 from modeler.types.solution import FocalLength as FocalLength
-from modeler.types.solution import LoopOpening as LoopOpening
+from modeler.types.solution import LoopClosureError as LoopClosureError
 from modeler.types.solution import Solution as Solution
 from modeler.types.solution import joined_without as joined_without
-from modeler.types.solution import loop_opening as loop_opening
-from modeler.types.solution import loop_openings as loop_openings
+from modeler.types.solution import loop_closure_error as loop_closure_error
+from modeler.types.solution import loop_closure_errors as loop_closure_errors
 from modeler.types.solution import loops_closed as loops_closed
 from modeler.types.solution import segments as segments
 from modeler.types.verdict import Check as Check

@@ -36,7 +36,7 @@ class Outcome(enum.Enum):
         "The object is hard to segment; give a region of interest, a largest depth, or masks that hold only the "
         "object.",
     )
-    NOT_KNOWN = (
+    NOT_APPLICABLE = (
         "prior does not apply",
         "These views lack what the prior needs; show it to the camera, or use another prior.",
     )

@@ -32,7 +32,7 @@ class AbstractPoseDensity(ABC):
     def log_density(self, target_from_source: Array) -> Array:
         """Return the normalised log density (n,) of poses (n, 4, 4); -inf outside the support."""
 
-    def log_evidence(self, target_from_source: Array) -> Array:
+    def log_prior(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of the independent evidence at poses (n, 4, 4), which enters the posterior.
 
         By default the whole density if it is evidence; if it is a proposal, 0 within its support and -inf outside.

@@ -83,7 +83,7 @@ class Posterior:
     """Effective sample size."""
     pareto_k: float = float("nan")
     """Tail index of the weights; above 0.7 their mean is unreliable."""
-    log_evidence: float = float("nan")
+    log_marginal_likelihood: float = float("nan")
     """Log of the mean likelihood under the prior, relative to no match at all (nats)."""
     seconds: float = float("nan")
     """Wall time of the registration in s."""

@@ -101,10 +101,10 @@ class LowOverlap:
 
 
 @dataclass(frozen=True)
-class LowEvidence:
+class LowLikelihood:
     """The images match far worse than those of other edges."""
 
-    log_evidence: float
+    log_marginal_likelihood: float
     median_nats: float
 
 
@@ -163,7 +163,7 @@ Reason: TypeAlias = (
     | PriorRefused
     | Degenerate
     | LowOverlap
-    | LowEvidence
+    | LowLikelihood
     | NotPlaced
     | OpenRotation
     | Consistency
@@ -227,8 +227,8 @@ def summary(reason: Reason) -> str:
             return "the covariance is not positive definite: the registration is degenerate"
         case LowOverlap(overlap, min_overlap):
             return f"the overlap {overlap:.2f} is below {min_overlap:.2f}"
-        case LowEvidence(log_evidence, median_nats):
-            return f"the images contradict it: log evidence {log_evidence:.0f}, median of other edges {median_nats:.0f}"
+        case LowLikelihood(nats, median_nats):
+            return f"the images contradict it: log likelihood {nats:.0f}, median of other edges {median_nats:.0f}"
         case NotPlaced():
             return "neither the previous view nor another one places the frame reliably"
         case OpenRotation(sigma_deg):

@@ -286,7 +286,7 @@ def _parts(ends: npt.NDArray[np.int64], everything: npt.NDArray[np.int64]) -> in
 
 
 @dataclass(frozen=True)
-class LoopOpening:
+class LoopClosureError:
     """The error of a chain of odometry edges against the closure that joins its ends, before the optimisation."""
 
     source: int
@@ -312,7 +312,9 @@ class LoopOpening:
         )
 
 
-def loop_openings(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> list[LoopOpening]:
+def loop_closure_errors(
+    edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]
+) -> list[LoopClosureError]:
     """Compare each accepted closure whose ends a chain of odometry edges joins with that chain.
 
     Needs no ground truth: a closure error of many standard deviations shows errors that are not part of the
@@ -335,18 +337,20 @@ def loop_openings(edges: Sequence[Edge], solution: Solution, centroids_m: Mappin
     ]
 
 
-def loop_opening(edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]) -> LoopOpening | None:
+def loop_closure_error(
+    edges: Sequence[Edge], solution: Solution, centroids_m: Mapping[int, Array]
+) -> LoopClosureError | None:
     """Return the closure error of the loop with most edges, the largest of several; None without a loop."""
-    openings = loop_openings(edges, solution, centroids_m)
-    return max(openings, key=lambda opening: (opening.edges, opening.sigmas), default=None)
+    errors = loop_closure_errors(edges, solution, centroids_m)
+    return max(errors, key=lambda error: (error.edges, error.sigmas), default=None)
 
 
-def _opening(edge: Edge, closure: PoseGaussian, chain: PoseGaussian, count: int, centroid_m: Array) -> LoopOpening:
+def _opening(edge: Edge, closure: PoseGaussian, chain: PoseGaussian, count: int, centroid_m: Array) -> LoopClosureError:
     """Return the error between a closure and the chain of its frames."""
     xi = se3.log(se3.inverse(closure.mean) @ chain.mean)
     squared = xi @ np.linalg.solve(closure.covariance + chain.covariance, xi)
     moved_m = se3.transform(chain.mean, centroid_m[None]) - se3.transform(closure.mean, centroid_m[None])
-    return LoopOpening(
+    return LoopClosureError(
         source=edge.source,
         target=edge.target,
         edges=count,

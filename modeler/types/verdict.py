@@ -56,7 +56,7 @@ class Shortcoming:
     code: str
     """For programs: `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
     `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
-    `not_tried`, `seen_through`, `absent`, `little_overlap`, `other_modes`, `unsure_rotation`,
+    `not_tried`, `free_space_violations`, `false_surface`, `little_overlap`, `other_modes`, `unsure_rotation`,
     `unsure_place`, `unsure_focal` or `unsure_size`."""
     words: str
     """For people."""
@@ -70,7 +70,8 @@ class Verdict:
     """Reasons not to trust it; empty if it can be trusted."""
     checks: Mapping[str, Check] = field(default_factory=dict)
     """By name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
-    `graph_chi2`, `seen_through`, `absent`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, as available."""
+    `graph_chi2`, `free_space_violations`, `false_surface`, `other_modes`, `pose_sd_deg`, `pose_sd_m` and `size_m`, as
+    available."""
     tolerance_m: float = 0.0
     """Error of the surface above which a model is called wrong."""
 

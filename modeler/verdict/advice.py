@@ -189,7 +189,7 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
         **dict.fromkeys(("unsure_masks", "no_motion"), _region),
         **dict.fromkeys(("loop_open", "edges_disagree"), _camera),
         "closures_refused": _camera,
-        **dict.fromkeys(("seen_through", "absent"), _surface),
+        **dict.fromkeys(("free_space_violations", "false_surface"), _surface),
         **dict.fromkeys(("little_overlap", "other_modes"), _more_known),
         **dict.fromkeys(("unsure_rotation", "unsure_place"), _more_known),
         "unsure_focal": _full_turn,
@@ -208,7 +208,7 @@ def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
 
 def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
     """Return a check of the masks if a loop and all other checks confirm the poses, else a stronger prior."""
-    if report["closed"] and set(report["reason_codes"]) <= {"seen_through", "absent", "unsure_size"}:
+    if report["closed"] and set(report["reason_codes"]) <= {"free_space_violations", "false_surface", "unsure_size"}:
         words = "the loop confirms the poses; check in the report whether masks or filled holes exceed the object"
         return Remedy(words, first="modeler report {run}")
     return _more_known(report, prior)

@@ -22,7 +22,7 @@ from modeler.types import (
     FocalLength,
     InputError,
     JoinsSegments,
-    LoopOpening,
+    LoopClosureError,
     RayImage,
     Solution,
 )
@@ -35,10 +35,10 @@ TAIL: Final = 1e-6
 """Probability per pair of contradicting the prior by chance: one of 100 runs of 100 pairs."""
 LOOP_TAIL: Final = 1e-3
 """Probability that a run has such loop closure errors by chance; that of the closure gate."""
-MAX_SEEN_THROUGH: Final = 0.1
+MAX_VIOLATIONS: Final = 0.1
 """Share of a frame's surface in the free space of other frames, by more than the tolerance: a model is called wrong if
 less than 90 % of its surface lies within it of the true one."""
-MAX_ABSENT: Final = 0.02
+MAX_FALSE_SURFACE: Final = 0.02
 """Share of a frame's surface contradicted by the frames that observe it: 0.005 at most in 17 right runs, five of them
 captures; 0.04 for a box with a post of 3 cm in an upside-down pose."""
 TOLERANCE: Final = 0.075
@@ -120,20 +120,20 @@ def prior_distances(
             continue
         posterior = edge.posterior
         means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
-        here = float(density.log_evidence(means).max())
+        here = float(density.log_prior(means).max())
         if np.isfinite(here):  # not at a limit of the search, where the posterior is cut off
             found.append((edge, _distance_nats(density, here)))
     return found
 
 
 def _distance_nats(density: AbstractPoseDensity, here: float) -> float:
-    """Return how far from the mode of a density, in nats of a Gaussian, a pose of log evidence `here` is.
+    """Return how far from the mode of a density, in nats of a Gaussian, a pose of log prior `here` is.
 
     For a Gaussian it is the difference of the logs. For densities with a wide part of little mass, such as a possible
     regrasp, it is at most the distance that a pose drawn from a Gaussian exceeds with the same probability.
     """
     drawn = density.sample(_DRAWS, np.random.default_rng(0))
-    logs = density.log_evidence(drawn)
+    logs = density.log_prior(drawn)
     weights = np.exp(logs - density.log_density(drawn))
     rarer = float(weights[logs <= here].sum() / weights.sum())
     height = max(float(logs.max()) - here, 0.0)
@@ -168,16 +168,16 @@ def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
     return Check(sum(squared) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
-def loop_check(openings: Sequence[LoopOpening]) -> tuple[LoopOpening, Check] | None:
+def loop_check(errors: Sequence[LoopClosureError]) -> tuple[LoopClosureError, Check] | None:
     """Return the loop with the largest closure error in standard deviations, with its limit; None without a loop.
 
     The NEES of a closure error follows χ² with six degrees of freedom. For the largest of several loops, the tail
     probability is at most their number times as large (Bonferroni).
     """
-    finite = [opening for opening in openings if np.isfinite(opening.sigmas)]
+    finite = [error for error in errors if np.isfinite(error.sigmas)]
     if not finite:
         return None
-    worst = max(finite, key=lambda opening: opening.sigmas)
+    worst = max(finite, key=lambda error: error.sigmas)
     return worst, Check(worst.sigmas, float(np.sqrt(chdtri(6, LOOP_TAIL / len(finite)) / 6.0)))
 
 
@@ -411,7 +411,7 @@ def size_check(
         if frame in trajectory
     ]
     surface_m = np.concatenate(surfaces_m) if surfaces_m else np.zeros((1, 3))
-    reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_SEEN_THROUGH)
+    reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_VIOLATIONS)
     return Check(scale_sigma * float(reach_m), tolerance_m)
 
 
@@ -421,11 +421,11 @@ class FreeSpace:
 
     frame: int
     """Number of the frame with the largest share of free-space violations."""
-    seen_through: Check
+    violations: Check
     """That share of all observations of its surface by others and of theirs by it."""
     contradicted_frame: int
     """Number of the frame with the largest share of contradicted surface."""
-    absent: Check
+    false_surface: Check
     """That share: points in the free space of two frames or more, and of most of those that observe them."""
 
 
@@ -466,9 +466,9 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
     worst, barest = int(np.argmax(shares)), int(np.argmax(bare))
     return FreeSpace(
         frames[worst],
-        Check(float(shares[worst]), MAX_SEEN_THROUGH),
+        Check(float(shares[worst]), MAX_VIOLATIONS),
         frames[barest],
-        Check(float(bare[barest]), MAX_ABSENT),
+        Check(float(bare[barest]), MAX_FALSE_SURFACE),
     )
 
 

@@ -29,7 +29,7 @@ from modeler.types import (
     Verdict,
     explain,
     joined_without,
-    loop_openings,
+    loop_closure_errors,
     loops_closed,
     segments,
 )
@@ -158,9 +158,9 @@ def _found(
         )
         found.append(_Finding("prior_chi2", together, "prior_contradicted", words))
     centroids_m = {frame: view.centroid_m for frame, view in views.items()}
-    if (loop := loop_check(loop_openings(step.edges_so_far, solution, centroids_m))) is not None:
-        opening, check = loop
-        words = f"{opening.words}: the focal length, the depth scale or an edge is wrong"
+    if (loop := loop_check(loop_closure_errors(step.edges_so_far, solution, centroids_m))) is not None:
+        error, check = loop
+        words = f"{error.words}: the focal length, the depth scale or an edge is wrong"
         found.append(_Finding("loop_sigmas", check, "loop_open", words))
     if (fit := graph_check(edges, solution)) is not None:
         words = (
@@ -170,15 +170,15 @@ def _found(
         found.append(_Finding("graph_chi2", fit, "edges_disagree", words))
     if (free := free_space(views, solution.trajectory, tolerance_m)) is not None:
         words = (
-            f"{100.0 * free.seen_through.value:.0f} % of the surface of frame {free.frame} violates the free space of "
+            f"{100.0 * free.violations.value:.0f} % of the surface of frame {free.frame} violates the free space of "
             f"other frames by more than {1000.0 * tolerance_m:.1f} mm: {_NO_SURFACE}"
         )
-        found.append(_Finding("seen_through", free.seen_through, "seen_through", words))
+        found.append(_Finding("free_space_violations", free.violations, "free_space_violations", words))
         words = (
-            f"{100.0 * free.absent.value:.0f} % of the surface of frame {free.contradicted_frame} is contradicted by "
-            f"most frames that observe it: {_NO_SURFACE}"
+            f"{100.0 * free.false_surface.value:.0f} % of the surface of frame {free.contradicted_frame} is "
+            f"contradicted by most frames that observe it: {_NO_SURFACE}"
         )
-        found.append(_Finding("absent", free.absent, "absent", words))
+        found.append(_Finding("false_surface", free.false_surface, "false_surface", words))
     others = other_modes(edges, solution, views, tolerance_m)
     words = f"with a probability of {100.0 * others.value:.0f} %, some pair is at a wrong mode"
     found.append(_Finding("other_modes", others, "other_modes", words))

@@ -63,9 +63,9 @@ def row(folder: Path) -> str:
             error_deg = rotation_error_deg(found.pose.mean, true_motion(poses, target.index, source.index))
             acceptable = found.usable and found.overlap >= Thresholds.min_overlap
             if prior is None and acceptable and error_deg < _RIGHT_DEG:
-                right.append(found.log_evidence)
+                right.append(found.log_marginal_likelihood)
             elif prior is not None and acceptable and error_deg > _WRONG_DEG:
-                wrong.append(found.log_evidence)
+                wrong.append(found.log_marginal_likelihood)
     median = float(np.median(right))
     scatter = 1.4826 * float(np.median(np.abs(np.array(right) - median)))
     drops = " ".join(f"{median - nats:.0f}" for nats in sorted(wrong, reverse=True))

@@ -387,13 +387,13 @@ CHECKS: Final = {
         "mean squared residual of the edges",
         "Distance of the registrations from the optimised poses, in units of their variance; 1 is expected.",
     ),
-    "seen_through": Check(
+    "free_space_violations": Check(
         "free-space violations: surface of a frame in the free space of others",
         "Another frame measured something behind it, although it should occlude that: one of the two poses is wrong.",
         100.0,
         " %",
     ),
-    "absent": Check(
+    "false_surface": Check(
         "false surface: surface of a frame contradicted by others",
         "It lies in the free space of most frames that observe it: the pose of this frame is wrong, or its mask "
         "includes more than the object.",

@@ -112,7 +112,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]
         sampled = [self._sampled(noisy, density, mode, rng) for mode in modes_found]
         compared = comparable(sampled, noisy)
-        if found.open_rotation:
+        if found.any_rotation:
             compared = overlapping(compared, pair.overlap, self.min_overlap)
         dense = self.likelihood.denser(noisy, rng)
         modes = [(share, self._refined(noisy, dense, density, mode, rng)) for share, mode in weigh_modes(compared)]
@@ -137,7 +137,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         volumes = np.log(np.diagonal(found.spreads, axis1=1, axis2=2)).sum(axis=1)
         log_weights = likelihood(found.poses, np.zeros(len(found.poses))) + volumes
         if len(density.alternatives) > 1:
-            log_weights += density.log_evidence(found.poses)
+            log_weights += density.log_prior(found.poses)
         gaussians = GaussianMixture(found.poses, found.spreads, log_weights, pair.centre_m)
         nuisance = first_order(pair, found.poses[0], found.spreads[0], noise_m)
         proposal = MixtureProposal(density, gaussians)
@@ -155,7 +155,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return refined samples of a mode; those that would leave the prior's support are kept unchanged."""
         fine_m = self.search.fine_m(pair)
         refined = replace(samples, poses=self.refiner.refine(pair, dense, samples, rng, fine_m=fine_m))
-        inside = np.isfinite(density.log_evidence(refined.under_focal_lengths))
+        inside = np.isfinite(density.log_prior(refined.under_focal_lengths))
         poses = np.where(inside[:, None, None], refined.poses, samples.poses)
         return replace(samples, poses=poses).conditional(pair.centre_m)
 
@@ -198,7 +198,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         overlap = pair.overlap(modes[0].pose.mean)
         # Among very many poses, some match by chance; among few, the likeliest is right even if a mask is truncated.
         contradicted = not pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
-        matches = not (found.open_rotation and contradicted)
+        matches = not (found.any_rotation and contradicted)
         effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighted)
         return Posterior(
             source=pair.backward.image.index,
@@ -213,7 +213,7 @@ class VisibilityRegistrar(AbstractRegistrar):
             modes=modes if len(modes) > 1 else (),
             effective_samples=effective,
             pareto_k=max(mode.pareto_k for _, mode in weighted),
-            log_evidence=float(np.logaddexp.reduce([mode.log_evidence for _, mode in weighted])),
+            log_marginal_likelihood=float(np.logaddexp.reduce([mode.log_marginal_likelihood for _, mode in weighted])),
             seconds=seconds,
         )
 
@@ -248,7 +248,7 @@ def comparable(modes: list[ModeSamples], pair: PairLikelihood) -> list[WeightedS
         gains.append(float((_tempered(without_holes, reference, *found) - _tempered(pair, mode, *found))[0]))
     of_reference = gains[modes.index(reference)]
     return [
-        replace(mode.samples, log_evidence=mode.samples.log_evidence + gain - of_reference)
+        replace(mode.samples, log_marginal_likelihood=mode.samples.log_marginal_likelihood + gain - of_reference)
         for mode, gain in zip(modes, gains, strict=True)
     ]
 

@@ -107,9 +107,9 @@ class MixtureProposal(AbstractPoseDensity):
         """Return the log density (n,) of the proposal at poses (n, 4, 4)."""
         return self.gaussians.log_density(target_from_source) - self.gaussians.log_weight
 
-    def log_evidence(self, target_from_source: Array) -> Array:
+    def log_prior(self, target_from_source: Array) -> Array:
         """Return the log density (n,) of the prior at poses (n, 4, 4)."""
-        return self.known.log_evidence(target_from_source)
+        return self.known.log_prior(target_from_source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class WeightedSamples:
     """(n,), their sum 1."""
     log_likelihoods: Array
     """(n,)."""
-    log_evidence: float
+    log_marginal_likelihood: float
     """Log of the mean likelihood under the prior."""
     pareto_k: float
     """Pareto tail index of the weights of all samples drawn."""
@@ -161,7 +161,7 @@ class WeightedSamples:
 
 def weigh_modes(modes: Sequence[WeightedSamples]) -> list[tuple[float, WeightedSamples]]:
     """Return the modes with their posterior probabilities, heaviest first, without negligible ones."""
-    mass = normalised(np.array([mode.log_evidence for mode in modes]))
+    mass = normalised(np.array([mode.log_marginal_likelihood for mode in modes]))
     kept = [number for number in np.argsort(-mass, kind="stable") if mass[number] >= MIN_MODE_SHARE]
     return [(float(mass[number] / mass[kept].sum()), modes[number]) for number in kept]
 
@@ -245,7 +245,7 @@ class AdaptiveSampler:
         def weighted(poses: Array, log_density: Array) -> _Draws:
             log_focal = nuisance.draw(len(poses), rng)
             moved = nuisance.under(poses, log_focal)
-            log_prior = proposal.log_evidence(moved)
+            log_prior = proposal.log_prior(moved)
             possible = np.isfinite(log_prior)
             log_likelihoods = np.full(len(poses), -np.inf)
             if possible.any():

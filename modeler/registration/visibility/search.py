@@ -31,7 +31,7 @@ class Candidates:
     """(k,) tempered log-likelihoods (nats)."""
     spreads: Array
     """(k, 6, 6) lower triangular roots of the covariances of ξ about the source's centroid (method, eq. 5.3)."""
-    open_rotation: bool = False
+    any_rotation: bool = False
     """Whether the prior leaves the rotation open: by `OPEN_ROTATION_RAD` or more in every direction."""
     beyond_gain: float = -np.inf
     """Difference in nats between the best pose beyond the prior's support and the best candidate."""
@@ -135,21 +135,21 @@ class Search:
         descents = [self._descended(pair, part, prior, rng) for part, prior in zip(parts, priors, strict=True)]
         started, poses = (np.concatenate(kind) for kind in zip(*descents, strict=True))
         part = np.repeat(np.arange(len(parts)), [len(ended) for _, ended in descents])
-        inside = np.isfinite(density.log_evidence(poses))
+        inside = np.isfinite(density.log_prior(poses))
         outside = poses[~inside]
         poses, part = (poses[inside], part[inside]) if inside.any() else (started, part)
-        open_rotation = any(_is_open(prior) for prior in priors)
-        blur_m, misfit = self._nuisance(pair, poses, open_rotation=open_rotation)
+        any_rotation = any(_is_open(prior) for prior in priors)
+        blur_m, misfit = self._nuisance(pair, poses, any_rotation=any_rotation)
         likelihoods = pair.tempered(poses, blur_m, typical_misfit=misfit, stride=_STRIDE)
         # One alternative may be far denser than another, so that the likelihood alone does not rank modes.
-        scores = likelihoods + density.log_evidence(poses) if len(parts) > 1 else likelihoods
+        scores = likelihoods + density.log_prior(poses) if len(parts) > 1 else likelihoods
         order = np.argsort(-scores, kind="stable")
         # The volumes of two modes may differ as much as their likelihoods: hence twice the log of a negligible share.
         order = order[scores[order] > scores.max() + 2.0 * np.log(MIN_MODE_SHARE)]
         poses, part = poses[order], part[order]
         precisions = np.array([np.linalg.inv(prior.covariance) for prior in priors], dtype=np.float64)[part]
         spreads = _spreads(pair, precisions, poses, blur_m)
-        found = Candidates(poses, scores[order], spreads, open_rotation)
+        found = Candidates(poses, scores[order], spreads, any_rotation)
         if pair.overlap(found.poses[0]) > min_overlap:
             outside = self._near_support(pair, priors[-1], density, outside)
         found = found.distinct(pair.centre_m)
@@ -192,7 +192,7 @@ class Search:
             remaining &= np.linalg.norm(distances, axis=1) > 1.0
         return motions[kept]
 
-    def _nuisance(self, pair: PairLikelihood, poses: Array, *, open_rotation: bool) -> tuple[float, float]:
+    def _nuisance(self, pair: PairLikelihood, poses: Array, *, any_rotation: bool) -> tuple[float, float]:
         """Return the noise b in m and the misfit μ of a typical match at the best of some poses (n, 4, 4).
 
         b is at least the smallest blur. With less noise, likelihoods of poses that fit equally well would differ by
@@ -202,7 +202,7 @@ class Search:
         fine_m = self.fine_m(pair)
         best = poses[np.argmax(pair.tempered(poses, fine_m, stride=_COARSE_STRIDE))]
         blur_m = max(pair.noises_m(best, fine_m)[0], fine_m)
-        return blur_m, MISFIT if open_rotation else pair.typical_misfit(best, blur_m)
+        return blur_m, MISFIT if any_rotation else pair.typical_misfit(best, blur_m)
 
     def _regulariser(self, pair: PairLikelihood, prior: PoseGaussian) -> Regulariser:
         """Return the regulariser of a descent: the prior's Gaussian, and damping (method, eq. 5.2).
@@ -227,7 +227,7 @@ class Search:
         back = se3.difference(poses, prior.mean, pair.centre_m)
         basins = np.linalg.norm(back / self.extent(pair), axis=1, keepdims=True)
         nearer = se3.moved(poses, back / np.maximum(basins, 1.0), pair.centre_m)
-        return poses[np.isfinite(density.log_evidence(nearer))]
+        return poses[np.isfinite(density.log_prior(nearer))]
 
 
 def _moments(pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator) -> PoseGaussian:
