@@ -11,9 +11,9 @@ import numpy as np
 
 from modeler import se3
 from modeler.sequences.base import AbstractDerived, AbstractSequence
-from modeler.sequences.image_folders import trajectory
 from modeler.sequences.input_files import Node
 from modeler.sequences.recording import AbstractRecording
+from modeler.sequences.tum import trajectory
 from modeler.types import Array, BoolArray, Frame, HandPoses, InputError
 
 _MOST = 100  # capsules: 10 s a run of 100 frames

@@ -156,10 +156,10 @@ def read_labels(path: Path) -> npt.NDArray[np.uint8]:
         InputError: if the file is missing, broken or too large.
     """
     pixels, is_grey = _mask_pixels(path)
-    if is_soft(pixels):
-        return np.where(pixels >= np.ceil(pixels.max() / 2), 255, 0).astype(np.uint8)
-    occluded = (pixels == OCCLUDED) & is_grey  # a palette numbers things
-    return np.where(occluded, OCCLUDED, np.where(pixels != 0, 255, 0)).astype(np.uint8)
+    soft, few = is_soft(pixels), len(np.unique(pixels)) <= _FEW_LABELS
+    own = pixels >= np.ceil(pixels.max() / 2) if soft else pixels != 0
+    occluded = (pixels == OCCLUDED) & (is_grey and (few or not soft))  # a palette numbers things
+    return np.where(occluded, OCCLUDED, np.where(own, 255, 0)).astype(np.uint8)
 
 
 def _mask_pixels(path: Path) -> tuple[npt.NDArray[Any], bool]:

@@ -17,13 +17,13 @@ from modeler.sequences.image_folders import (
     images_in_folders,
     images_in_one_folder,
     open_colour_depth,
-    open_tum,
 )
 from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import SCHEME, open_camera
 from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.ray_distance import AxialSequence
+from modeler.sequences.tum import open_tum
 from modeler.system.regular_files import check_regular
 from modeler.types import InputError
 

@@ -188,7 +188,7 @@ def test_register_gives_the_edge_that_build_finds(cli: Run, built: Path) -> None
 def test_build_fills_a_run_folder(built: Path) -> None:
     assert {path.name for path in built.iterdir()} == FILES
     told = report(built)
-    assert (told["schema"], told["seed"], told["prior"]) == (1, 0, "table")
+    assert (told["schema"], told["seed"], told["prior"]) == (2, 0, "table")
     assert told["settings"] == {"method": "visibility", "colour": True, "voxel_m": 0.004, "every": 1, "frames": "0:3"}
     assert (told["complete"], told["trustworthy"], told["reasons"]) == (True, True, [])
     assert [(frame["id"], frame["outcome"]) for frame in told["frames"]] == [(k, "accepted") for k in range(3)]

@@ -168,7 +168,7 @@ def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None
         np.testing.assert_array_equal(posterior.pose.mean, sent.posterior.pose.mean)
         np.testing.assert_array_equal(posterior.pose.covariance, sent.posterior.pose.covariance)
         assert posterior.outcome is sent.posterior.outcome
-        for name in ("overlap", "effective_samples", "pareto_k", "log_evidence", "seconds"):
+        for name in ("overlap", "effective_samples", "pareto_k", "log_marginal_likelihood", "seconds"):
             np.testing.assert_equal(getattr(posterior, name), getattr(sent.posterior, name))
     for frame, pose in poses_of(report).items():
         np.testing.assert_array_equal(pose.mean, step.solution.trajectory[frame])

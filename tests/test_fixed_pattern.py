@@ -73,7 +73,7 @@ def ball_views(share: float, seed: int) -> list[RayImage]:
 def registered(share: float, seed: int) -> tuple[Posterior, float]:
     """Return the posterior of the ball's motion, and the NEES of its rotation."""
     target, source = ball_views(share, seed)
-    density = GeneralPrior().between(source, target)
+    density = GeneralPrior(max_offset_m=0.04).between(source, target)
     posterior = VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(seed))
     zero, one = tabletop.turntable(24)[:2]
     truth = zero @ se3.inverse(one) @ se3.translation(source.centroid_m)

@@ -105,7 +105,7 @@ def test_a_device_is_chosen_for_large_work_only(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("false_surface", "line"),
+    ("absent", "line"),
     [
         ("warp", "warp-lang is not installed; pip install -c constraints.txt -e '.[gpu]'"),
         ("driver", "there is no NVIDIA driver"),

@@ -16,7 +16,7 @@ from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
 from modeler.graph.covariance import chi_square_quantile
 from modeler.types import Array, Camera, Edge, Frame, PoseGaussian, RayImage, Solution
-from modeler.verdict.evidence import spread_of_positions
+from modeler.verdict.spreads import spread_of_positions
 from studies.loops import covariances
 
 SEEDS = 120

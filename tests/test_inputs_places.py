@@ -39,9 +39,9 @@ def test_pictures_that_lie_elsewhere_are_seen(
 ) -> None:
     for place in (tmp_path / "flat", tmp_path / "deeper" / "images"):
         shutil.copytree(written / "bop" / "depth", place)
-    for name in ("flat", "deeper"):
+    for name, words in (("flat", "no folder depth"), ("deeper", "no depth images")):
         assert main(["info", str(tmp_path / name)]) == 2
-        assert "no folder depth" in capsys.readouterr().err
+        assert words in capsys.readouterr().err
     (tmp_path / "deeper" / "images").rename(tmp_path / "deeper" / "Depth_16bit")
     assert main(["info", str(tmp_path / "deeper")]) == 2
     assert "Depth_16bit" in capsys.readouterr().err
@@ -74,6 +74,8 @@ def test_a_path_without_a_sequence_is_refused(tmp_path: Path, capsys: pytest.Cap
 @pytest.fixture
 def as_nobody() -> Iterator[Callable[[], None]]:
     """Return what gives root's rights up until the end of the test; others have none to give up."""
+    import rich.console  # noqa: F401  # messages load it, from where others may not read
+
     user = os.geteuid()
     yield lambda: os.seteuid(65534) if user == 0 else None
     os.seteuid(user)

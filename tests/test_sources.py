@@ -13,7 +13,12 @@ from source_trees import ROOT, SOURCES, nodes, tree
 
 MAX_LINES = 500
 HOLDS_ARRAYS = re.compile(r"^(?!Callable).*(Array|ndarray)")
-HOMES = {"gtsam": "modeler/graph/", "numba": "modeler/kernels/", "rerun": "viz/", "tyro": "modeler/cli/"}
+HOMES = {
+    "gtsam": "modeler/graph/",
+    "numba": "modeler/kernels/",
+    "rerun": "viz/",
+    "tyro": ("modeler/cli/", "modeler/composition/"),
+}
 
 
 def imported(path: Path) -> Iterator[str]:

@@ -98,7 +98,7 @@ def shown(
     if colour:
         small = replace(small, colour=recipe.colour, photography=recipe.photography, label=recipe.label)
     sequence = RenderedSequence(small)
-    modeler = Modeler(sensor=Sensor(sequence.sensor()), prior=TablePrior(max_rotation_deg=reach_deg))
+    modeler = Modeler(sensor=Sensor(sequence.sensor()), prior=TablePrior(max_rotation_deg=reach_deg, max_shift_m=0.05))
     frames = [sequence.frame(k) for k in sequence.indices]
     scene, truth = modeler.segmenter.scene(frames), sequence.truth()
     views = {frame.index: modeler.prepare(frame, scene).view for frame in frames}

@@ -45,14 +45,11 @@ from modeler.verdict.evidence import (
     free_space,
     graph_check,
     loop_check,
-    misfit,
-    one_axis_sd,
     other_modes,
     prior_check,
     prior_distances,
-    spread_of_positions,
-    spread_of_rotations,
 )
+from modeler.verdict.spreads import misfit, one_axis_sd, spread_of_positions, spread_of_rotations
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 AXES_M = np.array([0.09, 0.05, 0.03])

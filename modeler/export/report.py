@@ -27,7 +27,7 @@ from modeler.types import (
     loops_closed,
 )
 from modeler.verdict import judged
-from modeler.verdict.evidence import total_depth_scale_sigma
+from modeler.verdict.spreads import total_depth_scale_sigma
 
 _SCHEMA = 2
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")

@@ -25,7 +25,6 @@ _USED = (
     "scores",
     "gauss_newton",
     "mixture",
-    "shading",
 )
 _USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
 

@@ -43,6 +43,9 @@ from modeler.views.range_noise import RangeNoise
 _CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
 _NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
+_ELSEWHERE = (
+    0.3  # share of the moving pieces' score elsewhere from which the object is ambiguous: 0.4 chooses of two alike
+)
 RIVAL = 0.4  # ratio of the score of what else may be the object from which the choice is ambiguous
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _TOUCHING_PX = 3
@@ -143,7 +146,7 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     ndimage.label(layers.moved & allowed & near, output=regions)
     merit_of = _central(regions, depth, layers.front_share)
     large = merit_of > LEAST_PIECE * merit_of.max()
-    return large[regions], bool(elsewhere.sum() < RIVAL * merit.sum())
+    return large[regions], bool(elsewhere.sum() < _ELSEWHERE * merit.sum())
 
 
 def _standing_object(

@@ -46,7 +46,7 @@ class Segmenter:
     """Largest depth of the object in m; None = no limit."""
     min_points: int = 100
     """Number of pixels below which an object is too small to register."""
-    gap: float = 0.017
+    gap: float = 0.016
     """Largest gap between parts of one object, as a share of its distance: a dozen pixels of usual cameras."""
     noise: DepthNoise = field(default_factory=DepthNoise)
     """Expected noise of the depth camera; up to three times as much is distinguished from camera motion."""

@@ -20,8 +20,8 @@ from modeler.cli.convert import Convert
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.runs.reopening import solved
 from modeler.sequences import open_sequence, read_noise, survey, write_bop
-from modeler.sequences.image_folders import trajectory
 from modeler.sequences.rendering.recipe import load_recipe
+from modeler.sequences.tum import trajectory
 from modeler.types import Camera, Frame, InputError
 from studies.formats import clouds, image_folders, kinect, recorded, ros_bags
 from studies.fuzz.special import remove

@@ -1,0 +1,193 @@
+"""The uncertainty of a run's poses and of its model's size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from modeler import se3
+from modeler.types import Array, Check, Edge, FocalLength, RayImage, Solution
+from modeler.verdict.evidence import MAX_POINTS, MAX_VIOLATIONS, WRONG_RAD, WRONG_SHARE, graph_check
+
+_NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then accurate to 0.1 %
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The frame with the most uncertain pose."""
+
+    frame: int
+    """Frame number."""
+    check: Check
+    """Standard deviation, see `one_axis_sd`. At the limit, a Gaussian is wrong with probability `WRONG_SHARE`."""
+    count: int
+    """Number of frames beyond the limit."""
+
+
+def misfit(edges: Sequence[Edge], solution: Solution) -> float:
+    """Return the factor by which residuals of edges exceed their standard deviations, at least 1.
+
+    Args:
+        edges: those that take part.
+        solution: the poses.
+    """
+    fit = graph_check(edges, solution)
+    return 1.0 if fit is None else float(np.sqrt(max(fit.value, 1.0)))
+
+
+def spread_of_rotations(solution: Solution, factor: float = 1.0) -> Spread | None:
+    """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
+
+    What a wrong focal length does to the model is part of its size (`size_check`) and of `spread_of_positions`.
+
+    Args:
+        solution: the poses.
+        factor: on the standard deviations: `misfit`.
+    """
+    sigmas_deg = {}
+    for frame, covariance in solution.covariances.items():
+        given_focal = (covariance - _of_focal_length(solution, frame))[:3, :3]
+        sigmas_deg[frame] = float(np.degrees(one_axis_sd(factor**2 * given_focal, WRONG_RAD)))
+    return _widest(sigmas_deg, float(np.degrees(WRONG_RAD)))
+
+
+def spread_of_positions(
+    views: Mapping[int, RayImage], solution: Solution, tolerance_m: float, factor: float = 1.0
+) -> Spread | None:
+    """Return the largest uncertainty of the surface's position in a pose, in m; None without a pose.
+
+    What moves the surface of all views alike is not included, because it does not deform the model: a common shift, and
+    the stretch that a wrong focal length causes.
+
+    Args:
+        views: by frame number; the position is that of a view's centroid.
+        solution: the poses.
+        tolerance_m: error of the surface above which a model is wrong.
+        factor: on the standard deviations: `misfit`.
+    """
+    sigmas_m, deformed_m = {}, deformation_by_focal_length(views, solution)
+    for frame, covariance in solution.covariances.items():
+        if frame in views and len(views[frame].points_m):
+            given_focal = covariance - _of_focal_length(solution, frame)
+            of_place = se3.covariance_about(given_focal, views[frame].centroid_m)[3:, 3:]
+            of_place = of_place - _of_common_shift(solution, frame)
+            given_m = one_axis_sd(factor**2 * of_place, tolerance_m)
+            sigmas_m[frame] = float(np.hypot(given_m, deformed_m.get(frame, 0.0)))
+    return _widest(sigmas_m, tolerance_m)
+
+
+def _of_focal_length(solution: Solution, frame: int) -> Array:
+    """Return the covariance (6, 6) of a pose due to the focal length alone."""
+    focal = solution.focal
+    if focal is None or frame not in focal.by_focal:
+        return np.zeros((6, 6))
+    xi = focal.sigma * se3.adjoint(se3.inverse(solution.trajectory[frame])) @ focal.by_focal[frame]  # eq. 10.6
+    return np.outer(xi, xi)
+
+
+def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solution) -> dict[int, float]:
+    """Return by frame how a focal length wrong by one standard deviation deforms the model, in m (root mean square).
+
+    It stretches every view and moves its pose. What all views have in common, an affine map of the object, changes the
+    size of the model and its proportions by as much as the focal length; the rest puts the views' surfaces apart.
+    """
+    focal = solution.focal
+    frames = [frame for frame in views if focal is not None and frame in focal.by_focal and len(views[frame].points_m)]
+    if focal is None or not frames:
+        return {}
+    places, shifts = [], []
+    for frame in frames:
+        points_m = views[frame].points_m[:: max(len(views[frame].points_m) // MAX_POINTS, 1)]
+        place_m = se3.transform(solution.trajectory[frame], points_m)
+        stretch_m = -(points_m * [1.0, 1.0, 0.0]) @ solution.trajectory[frame][:3, :3].T
+        by_focal = focal.by_focal[frame]
+        places.append(place_m)
+        shifts.append(focal.sigma * (stretch_m + by_focal[3:] + np.cross(by_focal[:3], place_m)))
+    place_m, shift_m = np.concatenate(places), np.concatenate(shifts)
+    design = np.column_stack([place_m - place_m.mean(axis=0), np.ones(len(place_m))])
+    rest_m = shift_m - design @ np.linalg.lstsq(design, shift_m, rcond=None)[0]
+    ends = np.cumsum([len(place) for place in places])[:-1]
+    return {
+        frame: float(np.sqrt(np.mean(np.sum(part**2, axis=1))))
+        for frame, part in zip(frames, np.split(rest_m, ends), strict=True)
+    }
+
+
+def _of_common_shift(solution: Solution, frame: int) -> Array:
+    """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method, eq. 8.10)."""
+    if solution.common_shift_m2 is None:
+        return np.zeros((3, 3))
+    left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the pose of the graph's root is the identity
+    return np.asarray(left @ solution.common_shift_m2 @ left.T, dtype=np.float64)
+
+
+def one_axis_sd(covariance: Array, wrong: float) -> float:
+    """Return the standard deviation of an error along one axis that is wrong as often as a vector (3,).
+
+    It is at least that of the least certain axis; other uncertain axes increase it, at most to the root mean square
+    length, which counts where nearly every error is wrong.
+
+    Args:
+        covariance: (3, 3) of the vector.
+        wrong: length above which it is wrong.
+    """
+    small, middle, large = np.maximum(np.linalg.eigvalsh(covariance), 1e-300)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
+    # Given the components along two axes, the third is a Gaussian that has to make up for the rest.
+    rest = wrong**2 - small * nodes[:, None] ** 2 - middle * nodes**2
+    beyond = 2.0 * ndtr(-np.sqrt(np.maximum(rest, 0.0) / large))
+    share = float(weights @ beyond @ weights / weights.sum() ** 2)
+    quantile = float(-ndtri(0.5 * share))  # infinite if no error is wrong, 0 if every error is
+    equivalent = wrong / quantile if quantile > 0.0 else np.inf
+    return float(np.clip(equivalent, np.sqrt(large), np.sqrt(small + middle + large)))
+
+
+def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
+    """Return the largest standard deviation by frame number; `wrong` is the error above which a pose is wrong."""
+    limit = wrong / float(-ndtri(WRONG_SHARE / 2.0))
+    worst = max(sigmas, key=lambda frame: sigmas[frame], default=None)
+    if worst is None:
+        return None
+    return Spread(worst, Check(sigmas[worst], limit), sum(sigma > limit for sigma in sigmas.values()))
+
+
+def total_depth_scale_sigma(given: float, focal: FocalLength | None) -> float:
+    """Return the standard deviation of the depth scale's logarithm.
+
+    Loops cannot separate focal length and relief of the depth, so that the scale of one of them is as uncertain as they
+    moved the other.
+
+    Args:
+        given: as the camera was given.
+        focal: estimated from the loops of the run.
+    """
+    return given if focal is None else math.hypot(given, 0.5 * focal.log_factor)
+
+
+def size_check(
+    views: Mapping[int, RayImage], trajectory: Mapping[int, Array], scale_sigma: float, tolerance_m: float
+) -> Check:
+    """Return the uncertainty of the surface in m due to that of the model's scale.
+
+    A model is called wrong if less than 90 % of its surface lies within the tolerance: its reach is the distance from
+    its centre within which 90 % of the points lie.
+
+    Args:
+        views: by frame number.
+        trajectory: object_from_camera (4, 4) by frame number.
+        scale_sigma: standard deviation of the scale's logarithm.
+        tolerance_m: error of the surface above which a model is wrong.
+    """
+    surfaces_m = [
+        se3.transform(trajectory[frame], view.points_m[:: max(len(view.points_m) // MAX_POINTS, 1)])
+        for frame, view in views.items()
+        if frame in trajectory
+    ]
+    surface_m = np.concatenate(surfaces_m) if surfaces_m else np.zeros((1, 3))
+    reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_VIOLATIONS)
+    return Check(scale_sigma * float(reach_m), tolerance_m)
