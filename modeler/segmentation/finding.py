@@ -31,6 +31,7 @@ _ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
 _ZONE_MARGIN = 0.14  # distance from the object's zone at which it may still be, as a share of its distance
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
 _MOVED = 0.028  # of an object's outline between the frames from which its scene is learned, as a share of its distance
+_GAP_FLOORS = 15.0  # least gap in noise floors, 12 mm: nearby, the parts of a plush toy are as far apart
 _CREASE = 0.014  # creases of the support are at most so high, and so far from the object, as a share of its distance
 _LOW_SHARE = 0.3  # share of the object's height, for flat objects
 _CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
@@ -68,7 +69,7 @@ def find(
     """
     if scene.zone_m is None:
         return Found(np.zeros(depth_m.shape, dtype=np.bool_))
-    gap_m = gap * _distance_m(scene.zone_m)
+    gap_m = max(gap * _distance_m(scene.zone_m), _GAP_FLOORS * noise.floor_m)
     chosen = _choose(depth_m, camera, scene, noise, zone_m=scene.zone_m, gap_m=gap_m, occluder=occluder)
     mask = _refine(depth_m, camera, scene, noise, chosen=chosen.mask, reach_m=_reach_m(scene.zone_m), gap_m=gap_m)
     return replace(chosen, mask=mask)
