@@ -58,6 +58,8 @@ class Tracker:
     ) -> Generator[Searching, None, tuple[tuple[Posterior, ...], Placement]]:
         """Register a new view against views of the graph until the gate places it, or no attempt is left.
 
+        A registration that places it although the images contradict it has to stand against wider limits, too.
+
         Args:
             view: the new view.
             first: number of the view to register it against first.
@@ -72,12 +74,14 @@ class Tracker:
         search = self._search(view, first)
         placement, effort = Placement(), 0.0
         for attempt in search.attempts(stage):
+            if placement.base is not None and attempt.target != first:
+                break
             if search.made and attempt.effort <= effort:
                 yield Searching(view.index)
             search.add(attempt, self._registered(attempt))
             effort = attempt.effort
             placement = self.closer.placement(search.posteriors, self.state.map_view, steps=search.steps)
-            if placement.base is not None and effort == FULL:
+            if placement.base is not None and placement.base.convincing and effort == FULL:
                 break
         return search.posteriors, placement
 
