@@ -46,7 +46,6 @@ from modeler.verdict.evidence import (
     prior_distances,
 )
 from modeler.verdict.spreads import (
-    deformation_by_focal_length,
     misfit,
     size_check,
     spread_of_positions,
@@ -198,8 +197,7 @@ def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Fin
         value_mm, limit_mm = 1000.0 * place.check.value, 1000.0 * place.check.limit
         words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
         words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""
-        by_focal_m = deformation_by_focal_length(step.views, step.solution).get(place.frame, 0.0)
-        found.append(_explained(_Finding("pose_sd_m", place.check, "unsure_place", words), by_focal_m, focal))
+        found.append(_explained(_Finding("pose_sd_m", place.check, "unsure_place", words), place.by_focal_m, focal))
     return found
 
 

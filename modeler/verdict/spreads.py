@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -27,6 +27,8 @@ class Spread:
     """Standard deviation, see `one_axis_sd`. At the limit, a Gaussian is wrong with probability `WRONG_SHARE`."""
     count: int
     """Number of frames beyond the limit."""
+    by_focal_m: float = 0.0
+    """Part of a position's standard deviation in m that is due to the focal length."""
 
 
 def misfit(edges: Sequence[Edge], solution: Solution) -> float:
@@ -78,7 +80,8 @@ def spread_of_positions(
             of_place = of_place - _of_common_shift(solution, frame)
             given_m = one_axis_sd(factor**2 * of_place, tolerance_m)
             sigmas_m[frame] = float(np.hypot(given_m, deformed_m.get(frame, 0.0)))
-    return _widest(sigmas_m, tolerance_m)
+    widest = _widest(sigmas_m, tolerance_m)
+    return None if widest is None else replace(widest, by_focal_m=deformed_m.get(widest.frame, 0.0))
 
 
 def _of_focal_length(solution: Solution, frame: int) -> Array:
