@@ -13,15 +13,14 @@ from modeler.experiment import Experiment, Pairing, Trial
 from modeler.priors import GeneralPrior
 from modeler.types import (
     NOMINAL_FOCAL,
-    AbstractPoseDensity,
     AbstractRegistrar,
     Array,
     Frame,
     Outcome,
     PoseGaussian,
     Posterior,
-    RayImage,
     SensorNoise,
+    ViewPair,
 )
 
 BODY = tabletop.Box((0.05, 0.08, 0.035))
@@ -55,19 +54,11 @@ class Oracle(AbstractRegistrar):
 
     off_rad: float = 0.0
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
-        truth = POSES[target.index] @ se3.inverse(POSES[source.index])
-        error = se3.exp(rng.normal(size=6) * SIGMAS) @ se3.exp(np.array([self.off_rad, 0, 0, 0, 0, 0]))
+    def posterior_of(self, pair: ViewPair) -> Posterior:
+        truth = POSES[pair.target.index] @ se3.inverse(POSES[pair.source.index])
+        error = se3.exp(pair.rng.normal(size=6) * SIGMAS) @ se3.exp(np.array([self.off_rad, 0, 0, 0, 0, 0]))
         pose = PoseGaussian(truth @ se3.inverse(error), np.diag(SIGMAS**2))
-        return Posterior(source.index, target.index, pose, Outcome.CONVERGED, 0.5, seconds=0.25)
+        return Posterior(pair.source.index, pair.target.index, pose, Outcome.CONVERGED, 0.5, seconds=0.25)
 
 
 def experiment(**changes: object) -> Experiment:

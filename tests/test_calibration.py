@@ -19,7 +19,7 @@ from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.sampling import AdaptiveSampler
 from modeler.sequences.rendering.renderer import RenderedSequence
-from modeler.types import AbstractPoseDensity, AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage, ViewPair
 from modeler.viz.figures import coverage_curves
 from studies.calibration.__main__ import panels, run
 from studies.calibration.specimens import PRINTED, SPECIMENS, Specimen, load_specimen, recipe_names
@@ -105,16 +105,8 @@ class Looking(AbstractRegistrar):
 
     seen: list[RayImage]
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
-        self.seen.append(source)
+    def posterior_of(self, pair: ViewPair) -> Posterior:
+        self.seen.append(pair.source)
         return _posterior(PoseGaussian(np.eye(4), np.eye(6)))
 
 

@@ -32,6 +32,7 @@ from modeler.types import (
     RayImage,
     SensorNoise,
     Solution,
+    ViewPair,
 )
 from modeler.views import Sensor
 from modeler.viz.figures import rotation_errors
@@ -63,18 +64,10 @@ def test_pairs_frames_at_an_offset_of_the_sequence(pairing: Pairing, pairs: list
 class ContradictedWithin(AbstractRegistrar):
     """Knows the truth where any motion is possible; within limits, the images contradict its answer."""
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
-        turned = se3.moved(np.eye(4)[None], np.array([[3.0, 0.0, 0.0, 0.0, 0.0, 0.0]]), source.centroid_m)
-        wide = np.isfinite(density.log_density(turned)).all()
-        found = Oracle(off_rad=0.0 if wide else 0.6).register(source, target, density, rng=rng)
+    def posterior_of(self, pair: ViewPair) -> Posterior:
+        turned = se3.moved(np.eye(4)[None], np.array([[3.0, 0.0, 0.0, 0.0, 0.0, 0.0]]), pair.source.centroid_m)
+        wide = np.isfinite(pair.density.log_density(turned)).all()
+        found = Oracle(off_rad=0.0 if wide else 0.6).posterior_of(pair)
         return found if wide else replace(found, contradicted=True)
 
 
@@ -212,17 +205,9 @@ def test_sparse_experiments_give_methods_few_points() -> None:
         def __init__(self) -> None:
             self.seen: list[int] = []
 
-        def register(
-            self,
-            source: RayImage,
-            target: RayImage,
-            density: AbstractPoseDensity,
-            *,
-            rng: np.random.Generator,
-            effort: float = 1.0,
-        ) -> Posterior:
-            self.seen.extend([len(source.points_m), len(target.points_m)])
-            return Oracle().register(source, target, density, rng=rng)
+        def posterior_of(self, pair: ViewPair) -> Posterior:
+            self.seen.extend([len(pair.source.points_m), len(pair.target.points_m)])
+            return Oracle().posterior_of(pair)
 
     dense, thin = Counting(), Counting()
     list(experiment(methods={"dense": dense}).trials(Recording()))
@@ -259,18 +244,11 @@ def test_a_closed_turn_is_judged_by_what_all_its_steps_leave(known: bool) -> Non
     class Turning(AbstractRegistrar):
         """Turns by a little too much about one axis at every step."""
 
-        def register(
-            self,
-            source: RayImage,
-            target: RayImage,
-            density: AbstractPoseDensity,
-            *,
-            rng: np.random.Generator,
-            effort: float = 1.0,
-        ) -> Posterior:
-            truth = POSES[target.index] @ se3.inverse(POSES[source.index])
-            posterior = Oracle().register(source, target, density, rng=rng)
-            in_model = POSES[source.index] @ se3.exp(np.array([0, 0, 0.05, 0, 0, 0])) @ se3.inverse(POSES[source.index])
+        def posterior_of(self, pair: ViewPair) -> Posterior:
+            truth = POSES[pair.target.index] @ se3.inverse(POSES[pair.source.index])
+            posterior = Oracle().posterior_of(pair)
+            pose = POSES[pair.source.index]
+            in_model = pose @ se3.exp(np.array([0, 0, 0.05, 0, 0, 0])) @ se3.inverse(pose)
             return replace(posterior, pose=replace(posterior.pose, mean=truth @ in_model))
 
     plan = experiment(methods={"turning": Turning()}, pairing=Pairing(closed=True))

@@ -20,7 +20,7 @@ from modeler.cli import build, main
 from modeler.export import PairCache, Pairs, RunFolder, RunMeta, locked
 from modeler.priors import GeneralPrior
 from modeler.sequences import bundled, open_sequence
-from modeler.types import AbstractPoseDensity, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage, ViewPair
 from modeler.views import Sensor
 from studies.kills.commands import COMMANDS, CommandTrials, write_inputs
 from studies.kills.trials import KINDS, SAME, Trials
@@ -39,21 +39,13 @@ def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Return a list to which every registration is added."""
-    pairs, register = [], IcpRegistrar.register
+    pairs, posterior_of = [], IcpRegistrar.posterior_of
 
-    def noted(
-        self: IcpRegistrar,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
-        pairs.append((source.index, target.index))
-        return register(self, source, target, density, rng=rng, effort=effort)
+    def noted(self: IcpRegistrar, pair: ViewPair) -> Posterior:
+        pairs.append((pair.source.index, pair.target.index))
+        return posterior_of(self, pair)
 
-    monkeypatch.setattr(IcpRegistrar, "register", noted)
+    monkeypatch.setattr(IcpRegistrar, "posterior_of", noted)
     return pairs
 
 
@@ -297,7 +289,8 @@ def test_a_cached_registration_is_that_of_the_same_inputs_only(tmp_path: Path, a
 
     def ask(target: RayImage, prior: int = 0, seed: int = 0, effort: float = 1.0) -> int:
         density = priors[prior].between(views[1], target)
-        cache.register(IcpRegistrar(), views[1], target, density, rng=np.random.default_rng(seed), effort=effort)
+        pair = ViewPair(views[1], target, density, np.random.default_rng(seed), effort)
+        cache.posterior_of(IcpRegistrar(), pair)
         return len(asked)
 
     assert [ask(views[0]), ask(views[0])] == [1, 1]

@@ -41,6 +41,7 @@ from modeler.types import (
     SharedAxis,
     Solution,
     Step,
+    ViewPair,
     explain,
 )
 from modeler.views import Sensor
@@ -109,36 +110,29 @@ class Oracle(AbstractRegistrar):
     def least_effort(self) -> float:
         return 1.0 if self.quick is None else 0.25
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
-        if effort < 1.0:
+    def posterior_of(self, pair: ViewPair) -> Posterior:
+        if pair.effort < 1.0:
             assert self.quick is not None
-            return self.quick.register(source, target, density, rng=rng)
+            return self.quick.posterior_of(replace(pair, effort=1.0))
+        density = pair.density
         if isinstance(density, DefensiveMixture):  # the graph foretells it
             (guess,) = density.proposals
             assert isinstance(guess, KernelMixture)
-            np.testing.assert_allclose(guess.means[0, :3, :3], self._truth(source, target)[:3, :3], atol=0.1)
+            np.testing.assert_allclose(guess.means[0, :3, :3], self._truth(pair.source, pair.target)[:3, :3], atol=0.1)
             density = density.known
         assert isinstance(density, AnyDensity)
-        self.asked.append((source.index, target.index))
-        self.priors.append((source.index, target.index, density.steps))
-        target_from_source = self._truth(source, target)
-        error = se3.exp(self.noise * SIGMAS * rng.standard_normal(6))
-        lost = source.index in self.blind or (
-            (source.index, target.index) in self.apart and density.steps <= self.reach
+        self.asked.append((pair.source.index, pair.target.index))
+        self.priors.append((pair.source.index, pair.target.index, density.steps))
+        target_from_source = self._truth(pair.source, pair.target)
+        error = se3.exp(self.noise * SIGMAS * pair.rng.standard_normal(6))
+        lost = pair.source.index in self.blind or (
+            (pair.source.index, pair.target.index) in self.apart and density.steps <= self.reach
         )
         pose = PoseGaussian(target_from_source @ error, np.diag(SIGMAS**2))
         outcome = Outcome.NO_OVERLAP if lost else Outcome.CONVERGED
         samples = np.broadcast_to(pose.mean, (50, 4, 4))
         overlap = 0.0 if lost else 0.8
-        return Posterior(source.index, target.index, pose, outcome, overlap, samples, np.full(50, 0.02))
+        return Posterior(pair.source.index, pair.target.index, pose, outcome, overlap, samples, np.full(50, 0.02))
 
     def _truth(self, source: RayImage, target: RayImage) -> Array:
         return POSES[target.index] @ se3.inverse(POSES[source.index])

@@ -37,6 +37,7 @@ from modeler.types import (
     Searching,
     Solution,
     Step,
+    ViewPair,
     pooled,
 )
 from modeler.views import Sensor
@@ -85,18 +86,10 @@ class ByLimit(AbstractRegistrar):
     """By limit in degrees."""
     asked: list[float] = field(default_factory=list)
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
-        assert isinstance(density, Limited)
-        self.asked.append(density.limit_deg)
-        return self.posteriors[density.limit_deg]
+    def posterior_of(self, pair: ViewPair) -> Posterior:
+        assert isinstance(pair.density, Limited)
+        self.asked.append(pair.density.limit_deg)
+        return self.posteriors[pair.density.limit_deg]
 
 
 def registered(
@@ -174,19 +167,11 @@ class ContradictedWithin(AbstractRegistrar):
 
     anywhere: Outcome = Outcome.CONVERGED
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
-        wide = np.isfinite(density.log_density(turned(120.0)))
+    def posterior_of(self, pair: ViewPair) -> Posterior:
+        wide = np.isfinite(pair.density.log_density(turned(120.0)))
         pose = PoseGaussian(turned(120.0 if wide else TRUE_DEG), COVARIANCE)
         outcome = self.anywhere if wide else Outcome.CONVERGED
-        return Posterior(source.index, target.index, pose, outcome, 0.8, contradicted=not wide)
+        return Posterior(pair.source.index, pair.target.index, pose, outcome, 0.8, contradicted=not wide)
 
 
 @pytest.mark.parametrize(

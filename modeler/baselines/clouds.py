@@ -28,6 +28,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    ViewPair,
 )
 
 _START_SAMPLES = 1000
@@ -244,25 +245,16 @@ class AbstractCloudRegistrar(AbstractRegistrar):
             InputError: if the views lack what the method compares.
         """
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
+    def posterior_of(self, pair: ViewPair) -> Posterior:
         """Return the fit from the prior's centre; directions that the surfaces leave open have the prior's spread.
 
         Raises:
             InputError: if the views lack what the method compares.
         """
-        began = time.perf_counter()
-        initial = start(source, target, density, rng)
-        found = posterior(
-            source, target, initial, self.fit(source, target, initial.target_from_source, rng), self.min_fitness
-        )
+        began, source, target = time.perf_counter(), pair.source, pair.target
+        initial = start(source, target, pair.density, pair.rng)
+        fit = self.fit(source, target, initial.target_from_source, pair.rng)
+        found = posterior(source, target, initial, fit, self.min_fitness)
         return replace(found, seconds=time.perf_counter() - began)
 
 

@@ -20,7 +20,16 @@ from modeler.priors.general import GeneralDensity
 from modeler.registration.posterior import effective_samples, failed, intrinsics, pareto_tail, weighted_gaussian
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.se3 import matrices, rows
-from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, BoolArray, Outcome, Posterior, RayImage
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractRegistrar,
+    Array,
+    BoolArray,
+    Outcome,
+    Posterior,
+    RayImage,
+    ViewPair,
+)
 
 _SAMPLES, _UNIFORM_SAMPLES = 200_000, 2_000_000
 _PILOT = 4096  # poses by which the checks are ordered
@@ -52,17 +61,10 @@ class PaperRegistrar(AbstractRegistrar):
     device: gpu.Device = "auto"
     """Device that draws, tests and weights samples."""
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
+    def posterior_of(self, pair: ViewPair) -> Posterior:
         """Return the posterior of target_from_source; its outcome states failure."""
         started = time.perf_counter()
+        source, target, density, rng = pair.source, pair.target, pair.density, pair.rng
         if min(len(source.points_m), len(target.points_m)) < 10:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         views = measured(source, self.points, rng), measured(target, self.points, rng)

@@ -26,6 +26,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    ViewPair,
 )
 
 _DRAWN = 64  # poses at which priors are compared
@@ -128,23 +129,15 @@ class PairCache(AbstractPairCache):
     versions: Mapping[str, str]
     """Of the packages, with others of which results may be others."""
 
-    def register(
-        self,
-        registrar: AbstractRegistrar,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float,
-    ) -> Posterior:
+    def posterior_of(self, registrar: AbstractRegistrar, pair: ViewPair) -> Posterior:
         """Return the stored result of the same registration, or else register and store it."""
-        inputs = (registrar, sorted(self.versions.items()), rng.bit_generator.state, density.evidence, effort)
-        key = _key(inputs, (source, target), density)
-        stored = self.pairs.get(source.index, target.index, key)
+        state, evidence = pair.rng.bit_generator.state, pair.density.evidence
+        inputs = (registrar, sorted(self.versions.items()), state, evidence, pair.effort)
+        key = _key(inputs, (pair.source, pair.target), pair.density)
+        stored = self.pairs.get(pair.source.index, pair.target.index, key)
         if stored is not None:
             return stored
-        found = registrar.register(source, target, density, rng=rng, effort=effort)
+        found = registrar.posterior_of(pair)
         self.pairs.keep(found, key)
         return found
 

@@ -20,6 +20,7 @@ from modeler.types import (
     RayImage,
     Reason,
     Segmentation,
+    ViewPair,
 )
 from modeler.views import Sensor
 
@@ -89,9 +90,10 @@ class Registrations:
             effort: share (0..1] of the usual effort.
         """
         rng = np.random.default_rng([self.seed, source.index, target.index])
+        pair = ViewPair(source, target, density, rng, effort)
         if self.cache is None:
-            return self.registrar.register(source, target, density, rng=rng, effort=effort)
-        return self.cache.register(self.registrar, source, target, density, rng=rng, effort=effort)
+            return self.registrar.posterior_of(pair)
+        return self.cache.posterior_of(self.registrar, pair)
 
 
 def without_limits(within: Posterior, prior: AbstractPrior, attempt: Callable[[AbstractPrior], Posterior]) -> Posterior:

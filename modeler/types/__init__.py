@@ -14,6 +14,7 @@ from modeler.types.interfaces import AbstractPoseDensity as AbstractPoseDensity
 from modeler.types.interfaces import AbstractPrior as AbstractPrior
 from modeler.types.interfaces import AbstractRegistrar as AbstractRegistrar
 from modeler.types.interfaces import SharedAxis as SharedAxis
+from modeler.types.interfaces import ViewPair as ViewPair
 from modeler.types.model import Event as Event
 from modeler.types.model import Fusing as Fusing
 from modeler.types.model import ObjectModel as ObjectModel

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -137,8 +138,24 @@ class AbstractPrior(ABC):
         return None
 
 
+@dataclass(frozen=True, eq=False)
+class ViewPair:
+    """Two views to register, and all else on which the result depends."""
+
+    source: RayImage
+    """One view."""
+    target: RayImage
+    """Another."""
+    density: AbstractPoseDensity
+    """Prior density of target_from_source."""
+    rng: np.random.Generator
+    """Source of all randomness."""
+    effort: float = 1.0
+    """Share (0..1] of the usual effort, for pairs that may share no surface."""
+
+
 class AbstractRegistrar(ABC):
-    """A registration method: parameters as fields, one pure method."""
+    """A registration method: parameters as fields, one pure method. To write one, implement `posterior_of`."""
 
     @property
     def least_effort(self) -> float:
@@ -146,6 +163,10 @@ class AbstractRegistrar(ABC):
         return 1.0
 
     @abstractmethod
+    def posterior_of(self, pair: ViewPair) -> Posterior:
+        """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception."""
+
+    @final
     def register(
         self,
         source: RayImage,
@@ -155,29 +176,13 @@ class AbstractRegistrar(ABC):
         rng: np.random.Generator,
         effort: float = 1.0,
     ) -> Posterior:
-        """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception.
-
-        Args:
-            source: one view.
-            target: another.
-            density: prior density of target_from_source.
-            rng: source of all randomness.
-            effort: share (0..1] of the usual effort, for pairs that may share no surface.
-        """
+        """Return the posterior of target_from_source; for the arguments see `ViewPair`."""
+        return self.posterior_of(ViewPair(source, target, density, rng, effort))
 
 
 class AbstractPairCache(ABC):
     """Results of registrations that need not be repeated."""
 
     @abstractmethod
-    def register(
-        self,
-        registrar: AbstractRegistrar,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float,
-    ) -> Posterior:
+    def posterior_of(self, registrar: AbstractRegistrar, pair: ViewPair) -> Posterior:
         """Return the stored result of the same registration, or else register and store it."""

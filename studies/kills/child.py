@@ -14,6 +14,7 @@ from typing import Any
 from modeler.baselines import IcpRegistrar
 from modeler.cli import main
 from modeler.registration import VisibilityRegistrar
+from modeler.types import ViewPair
 
 _MAKING = os.O_CREAT | os.O_TRUNC
 
@@ -52,13 +53,13 @@ def run(log: Path, change: int, arguments: list[str]) -> int:
 
 def _note(kind: Any, notes: int) -> None:
     """Let a registrar tell of every pair that it begins with."""
-    register = kind.register
+    posterior_of = kind.posterior_of
 
-    def noted(self: Any, source: Any, target: Any, density: Any, **options: Any) -> Any:
-        os.write(notes, f"pair {source.index} {target.index}\n".encode())
-        return register(self, source, target, density, **options)
+    def noted(self: Any, pair: ViewPair) -> Any:
+        os.write(notes, f"pair {pair.source.index} {pair.target.index}\n".encode())
+        return posterior_of(self, pair)
 
-    kind.register = noted
+    kind.posterior_of = noted
 
 
 if __name__ == "__main__":

@@ -10,7 +10,14 @@ import numpy as np
 
 from modeler import se3
 from modeler.evaluation import true_motion
-from modeler.types import AbstractPoseDensity, AbstractRegistrar, Array, Outcome, PoseGaussian, Posterior, RayImage
+from modeler.types import (
+    AbstractRegistrar,
+    Array,
+    Outcome,
+    PoseGaussian,
+    Posterior,
+    ViewPair,
+)
 
 
 @final
@@ -25,22 +32,14 @@ class Known(AbstractRegistrar):
     sigma_m: float = 0.0005
     """Standard deviation of the object's place along each axis."""
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
+    def posterior_of(self, pair: ViewPair) -> Posterior:
         """Return the posterior of target_from_source."""
         sigmas = np.repeat([np.radians(self.sigma_deg), self.sigma_m], 3)
-        about_object = se3.translation(source.centroid_m)
-        error = about_object @ se3.exp(sigmas * rng.normal(size=6)) @ se3.inverse(about_object)
+        about_object = se3.translation(pair.source.centroid_m)
+        error = about_object @ se3.exp(sigmas * pair.rng.normal(size=6)) @ se3.inverse(about_object)
         carried = se3.adjoint(about_object)
         pose = PoseGaussian(
-            true_motion(self.camera_from_model, target.index, source.index) @ error,
+            true_motion(self.camera_from_model, pair.target.index, pair.source.index) @ error,
             carried @ np.diag(sigmas**2) @ carried.T,
         )
-        return Posterior(source.index, target.index, pose, Outcome.CONVERGED, overlap=0.8, seconds=0.0)
+        return Posterior(pair.source.index, pair.target.index, pose, Outcome.CONVERGED, overlap=0.8, seconds=0.0)

@@ -29,6 +29,7 @@ from modeler.types import (
     PoseGaussian,
     Posterior,
     RayImage,
+    ViewPair,
     are_separate,
     pooled,
 )
@@ -77,22 +78,14 @@ class VisibilityRegistrar(AbstractRegistrar):
         """A quarter of the usual effort."""
         return _LEAST_EFFORT
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
+    def posterior_of(self, pair: ViewPair) -> Posterior:
         """Return the posterior of target_from_source; its outcome states failure.
 
         With less than full effort, only the best mode is sampled: pairs that share no surface are the most expensive,
         as every mode that the search finds is sampled.
         """
-        method = self if effort == 1.0 else self.scaled(effort)
-        return method._registered(source, target, density, rng)
+        method = self if pair.effort == 1.0 else self.scaled(pair.effort)
+        return method._registered(pair.source, pair.target, pair.density, pair.rng)
 
     def scaled(self, effort: float) -> VisibilityRegistrar:
         """Return the method with a share (0..1] of the starts of a search and of the samples, of one mode."""

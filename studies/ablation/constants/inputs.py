@@ -11,10 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
 
-import numpy as np
-
 from modeler.types import (
-    AbstractPoseDensity,
     AbstractRegistrar,
     Array,
     BoolArray,
@@ -22,6 +19,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     Segmentation,
+    ViewPair,
 )
 
 Figures = dict[str, float | str]
@@ -85,20 +83,12 @@ class Recalling(AbstractRegistrar):
         """That of the method."""
         return self.registers.least_effort
 
-    def register(
-        self,
-        source: RayImage,
-        target: RayImage,
-        density: AbstractPoseDensity,
-        *,
-        rng: np.random.Generator,
-        effort: float = 1.0,
-    ) -> Posterior:
+    def posterior_of(self, pair: ViewPair) -> Posterior:
         """Return the posterior of target_from_source."""
-        state = rng.bit_generator.state
-        key = digest((self.registers, source.points_m, target.points_m, density, state, effort))
+        state = pair.rng.bit_generator.state
+        key = digest((self.registers, pair.source.points_m, pair.target.points_m, pair.density, state, pair.effort))
         if key not in REGISTERED:
-            REGISTERED[key] = self.registers.register(source, target, density, rng=rng, effort=effort)
+            REGISTERED[key] = self.registers.posterior_of(pair)
         return REGISTERED[key]
 
 
