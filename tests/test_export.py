@@ -1,5 +1,6 @@
 """What a run leaves is read by other programs as it was meant: poses, graph, and meshes in every format."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from modeler.export import (
     g2o_text,
     mesh_of,
     model_upright,
+    placement,
     read_model,
     report_of,
     simplified,
@@ -48,6 +50,34 @@ def loaded_mesh(path: Path) -> Any:
     if isinstance(loaded, trimesh.Scene):
         (loaded,) = loaded.geometry.values()
     return loaded
+
+
+def glb_tree(path: Path) -> dict[str, Any]:
+    """The JSON of a GLB file: its first chunk, after a header of 12 bytes and its own of 8."""
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+def glb_colours(path: Path) -> Array:
+    """The colours (n, 3) of the vertices of a GLB file as a screen shows them: encoded as sRGB, 0 to 255."""
+    tree, data = glb_tree(path), path.read_bytes()
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"]) == (5126, "VEC3")
+    view = tree["bufferViews"][accessor["bufferView"]]
+    start = 28 + int.from_bytes(data[12:16], "little") + view["byteOffset"]
+    linear = np.frombuffer(data, "<f4", 3 * accessor["count"], start).reshape(-1, 3).astype(np.float64)
+    return 255.0 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_a_glb_is_matt_and_no_metal(tmp_path: Path, coloured: bool) -> None:
+    write_mesh(ball(coloured=coloured), tmp_path / "ball.glb")
+    tree = glb_tree(tmp_path / "ball.glb")
+    (primitive,) = tree["meshes"][0]["primitives"]
+    material = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]
+    assert (material["metallicFactor"], material["roughnessFactor"]) == (0.0, 1.0)
+    assert material.get("baseColorFactor", [1, 1, 1, 1]) == [1, 1, 1, 1]
+    assert {*primitive["attributes"]} == {"POSITION", "NORMAL", *(("COLOR_0",) if coloured else ())}
 
 
 def test_trajectory_reads_back_to_the_last_digit() -> None:
@@ -135,7 +165,8 @@ def test_exported_mesh_is_the_same_surface(tmp_path: Path, suffix: str) -> None:
     if suffix.lower() != "stl":
         np.testing.assert_allclose(mesh.vertex_normals, model.vertex_normals, atol=1e-5)
         assert model.vertex_colours is not None
-        np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], model.vertex_colours, atol=1)
+        colours = glb_colours(out) if suffix == "glb" else mesh.visual.vertex_colors[:, :3]
+        np.testing.assert_allclose(colours, model.vertex_colours, atol=1)
     assert [path.name for path in out.parent.iterdir()] == [out.name]
 
 
@@ -232,8 +263,9 @@ def test_texture_needs_a_format_that_holds_it(tmp_path: Path) -> None:
 
 def test_bop_model_is_in_mm_about_its_centre_with_its_entry(tmp_path: Path) -> None:
     folder = tmp_path / "models"
-    write_bop(ball(), folder / "obj_000007.ply")
-    write_bop(ball(), folder / "obj_000002.ply")
+    place = placement(ball(), {"poses": [], "up": [0.0, -0.6, -0.8]}, "bbox", "z")
+    write_bop(ball(), folder / "obj_000007.ply", place)
+    write_bop(ball(), folder / "obj_000002.ply", place)
     entries = strict_json((folder / "models_info.json").read_text())
     assert list(entries) == ["2", "7"]
     entry = entries["7"]
@@ -241,9 +273,8 @@ def test_bop_model_is_in_mm_about_its_centre_with_its_entry(tmp_path: Path) -> N
     for axis in "xyz":
         assert entry[f"size_{axis}"] == pytest.approx(100.0, abs=0.5)
         assert entry[f"min_{axis}"] == pytest.approx(-50.0, abs=0.3)
-    np.testing.assert_allclose(entry["origin_m"], [0.0, 0.0, 0.8], atol=1e-6)
     mesh = loaded_mesh(folder / "obj_000007.ply")
-    back = mesh.vertices / 1000.0 + entry["origin_m"]
+    back = se3.transform(np.reshape(entry["object_from_mesh"], (4, 4)), np.asarray(mesh.vertices) / 1000.0)
     np.testing.assert_allclose(back, ball().vertices_m, atol=1e-6)
     header = (folder / "obj_000007.ply").read_bytes().split(b"end_header")[0].decode()
     kinds = {line.split()[1] for line in header.splitlines() if line.startswith("property") and "list" not in line}
@@ -251,10 +282,10 @@ def test_bop_model_is_in_mm_about_its_centre_with_its_entry(tmp_path: Path) -> N
     for broken, words in (("{", "not valid JSON"), ("[1]", "lists no objects"), ('{"cup": {}}', "lists no objects")):
         (folder / "models_info.json").write_text(broken)
         with pytest.raises(InputError, match=words):
-            write_bop(ball(), folder / "obj_000007.ply")
+            write_bop(ball(), folder / "obj_000007.ply", place)
         assert (folder / "models_info.json").read_text() == broken
     with pytest.raises(InputError, match="PLY files"):
-        write_bop(ball(), folder / "model.obj")
+        write_bop(ball(), folder / "model.obj", place)
 
 
 def test_tints_tell_what_is_known_of_vertices() -> None:

@@ -13,7 +13,7 @@ from run_builders import ball
 
 from modeler import se3
 from modeler.export import solids
-from modeler.runs.presets import Checks, mesh_checks
+from modeler.runs.checks import Checks, mesh_checks
 from modeler.sequences import open_sequence
 from modeler.types import Array, InputError, ObjectModel
 
@@ -182,11 +182,23 @@ def test_checks_tell_what_does_not_hold(tmp_path: Path) -> None:
     assert Checks().attempt(is_absent, "false_surface").held == ("false_surface",)
 
 
+def test_both_bop_exports_have_one_frame(cli: Run, built: Path, tmp_path: Path) -> None:
+    alone, preset = tmp_path / "models" / "obj_000001.ply", tmp_path / "bop"
+    assert cli("export", built, "--bop", "--out", alone).status == 0
+    assert cli("export", built, "--for", "bop", "--out", preset).status == 0
+    one, other = (trimesh.load_mesh(path) for path in (alone, preset / "models" / "obj_000001.ply"))
+    np.testing.assert_allclose(one.bounds, other.bounds, atol=0.5)  # mm; the preset fuses again
+    entries = [json.loads(path.with_name("models_info.json").read_text())["1"] for path in (
+        alone, preset / "models" / "obj_000001.ply"
+    )]  # fmt: skip
+    np.testing.assert_allclose(*(entry["object_from_mesh"] for entry in entries), atol=5e-4)
+
+
 @pytest.mark.parametrize(
     ("purpose", "name", "files"),
     [
-        ("foundationpose", "box.obj", {"box.obj", "box.obj.pose.json"}),
-        ("print", "box.stl", {"box.stl", "box.stl.pose.json"}),
+        ("foundationpose", "fp", {"model.obj", "model.mtl", "model.png", "model.obj.pose.json"}),
+        ("print", "solid", {"model.stl", "model.stl.pose.json"}),
         ("mujoco", "mj", {"mj.xml", "scene.xml", "visual.obj", "visual.obj.pose.json"}),
         ("urdf", "ur", {"ur.urdf", "visual.obj", "visual.obj.pose.json"}),
         ("bop", "bop", {"models", "onboarding_static"}),
@@ -200,15 +212,10 @@ def test_every_preset_ends_with_what_was_checked(
     last = ended.err.splitlines()[-1]
     assert (ended.status, ended.out) == (0, ""), ended.err
     assert last.startswith("modeler: checked: ")
-    folder = out if out.is_dir() else tmp_path
-    there = {
-        path.name
-        for path in folder.iterdir()
-        if not path.name.startswith(("part_", "box.mtl", "box.png", "visual.mtl", "visual.png"))
-    }
+    there = {path.name for path in out.iterdir() if not path.name.startswith(("part_", "visual.mtl", "visual.png"))}
     assert there == files
     if purpose == "print":
-        mesh = trimesh.load_mesh(out)
+        mesh = trimesh.load_mesh(out / "model.stl")
         assert mesh.is_watertight
         assert 20.0 < mesh.extents.max() < 400.0  # mm
     if purpose == "bop":
@@ -252,9 +259,9 @@ def _check_bop(out: Path, built: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--for", "print", "--out", "a.obj"), "writes .stl"),
-        (("--for", "foundationpose", "--out", "a.stl"), "writes .obj"),
-        (("--for", "print", "--out", "a.stl", "--up", "y"), "decides on --up"),
+        (("--for", "print", "--out", "a.stl"), "writes a folder"),
+        (("--for", "print", "--out", "a", "--up", "y"), "decides on --up"),
+        (("--for", "prints", "--out", "a"), "one of bop, foundationpose"),
         (("--for", "bop", "--out", "a", "--mass-kg", "1"), "goes with --for mujoco"),
         (("--for", "urdf", "--out", "a", "--mass-kg", "0"), "out of range"),
         (("--for", "urdf", "--out", "a", "--mass-kg", "1", "--density-kg-m3", "1"), "give one of them"),

@@ -86,6 +86,7 @@ _DESCRIPTION = (
 _ROOM = 7 * 2**27  # bytes of addresses that registering two frames takes, a third of them used
 _FILES = 256  # open at the same time: Rerun ends the process where it cannot open its own
 _THREAD_DIGITS = 3
+_CHOICES = re.compile(r"Expected one of \(([^)]*)\)")
 _HELP_INDENT = " " * 8  # of an option's description in the parser's error box
 
 
@@ -188,8 +189,15 @@ def _one_line(box: str) -> str:
             sections[-1].append(row)
     lines = [[" ".join(row.split()) for row in takewhile(bool, section)] for section in sections]
     what, *others = filter(None, lines)  # where there is no border, a line below the title is a section, too
+    what = _CHOICES.sub(_in_order, " ".join(what))
     suggested = [f"{first} {' or '.join(more)}" for first, *more in others if first.startswith("Perhaps")]
-    return "; ".join(line.rstrip(".") for line in (" ".join(what), *suggested))
+    return "; ".join(line.rstrip(".") for line in (what, *suggested))
+
+
+def _in_order(choices: re.Match[str]) -> str:
+    """Return the choices of an option in alphabetical order, without that which stands for none being given."""
+    names = {*re.findall(r"'([^']*)'", choices[1])} - {"None"}
+    return f"Expected one of {', '.join(sorted(names))}"
 
 
 def _run(command: Command) -> int:

@@ -33,12 +33,12 @@ class Export:
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Run folder of `modeler build`."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl}")]
-    """File to write; its suffix selects the format. STL has no colour. With --for a file or a folder."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl} or DIR")]
+    """File to write; its suffix selects the format. STL has no colour. With --for a folder."""
     purpose: Annotated[Purpose | None, tyro.conf.arg(name="for"), default("none")] = None
-    """Write all files for a program, read them back and check them: foundationpose (FILE.obj with texture),
-    bop (FOLDER with models and onboarding_static), mujoco and urdf (FOLDER with meshes, convex parts, mass, inertia),
-    print (watertight FILE.stl in mm with a flat bottom)."""
+    """Write a folder with all files for a program, read them back and check them: foundationpose (OBJ with texture),
+    bop (models and onboarding_static), mujoco and urdf (meshes, convex parts, mass, inertia), print (watertight STL in
+    mm with a flat bottom)."""
     overwrite: bool = False
     """Replace existing files."""
     origin: Annotated[Origin | None, default("base")] = None
@@ -55,7 +55,8 @@ class Export:
     texture_px: int = 2048
     """Side of that image, a square."""
     bop: bool = False
-    """Write a BOP model: PLY in mm, origin in the centre of its box, and its entry in models_info.json."""
+    """Write a BOP model: PLY in mm, origin in the centre of its box, z up, and its entry in models_info.json; the frame
+    of --for bop."""
     tint: Annotated[Literal["views", "sigma"] | None, default("none")] = None
     """Colour vertices by the number of views that saw them or by their standard deviation; interpolated surface is
     pink."""
@@ -109,8 +110,10 @@ class Export:
             model, texture = files.textured(model, volume.texture_colours, self.texture_px)
             say(texture_words(texture, volume))
         if self.bop:
-            files.write_bop(model, self.out)
+            place = files.placement(model, report, "bbox", "z")
+            files.write_bop(model, self.out, place)
             _report(model, self)
+            say(f"{place.words}; in mm")
         elif as_seen:
             files.write_mesh(model, self.out, texture, object_from_upright=files.model_upright(report))
             _report(model, self)
@@ -175,9 +178,7 @@ def _check(options: Export) -> None:
     if options.bop and suffix != ".ply":
         raise InputError(f"{options.out}: BOP models are PLY files; give --out a name such as obj_000001.ply")
     if options.bop and (options.origin or options.up):
-        raise InputError(
-            "--bop puts the origin in the centre of the box and keeps the axes; leave out --origin and --up"
-        )
+        raise InputError("--bop puts the origin in the centre of the box, z up; leave out --origin and --up")
     if options.density_kg_m3 is not None or options.mass_kg is not None:
         raise InputError("--density-kg-m3 and --mass-kg go with --for mujoco and --for urdf alone")
     _check_numbers(options)

@@ -7,6 +7,7 @@ from modeler.export.files import write_atomically as write_atomically
 from modeler.export.formats import g2o_text as g2o_text
 from modeler.export.formats import tum_text as tum_text
 from modeler.export.mesh import AS_GIVEN as AS_GIVEN
+from modeler.export.mesh import FORMATS as FORMATS
 from modeler.export.mesh import files_of as files_of
 from modeler.export.mesh import format_of as format_of
 from modeler.export.mesh import mesh_of as mesh_of

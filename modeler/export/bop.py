@@ -6,7 +6,6 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +24,17 @@ MODELS_INFO = "models_info.json"
 """BOP's list of models, in their folder."""
 
 
-def write_bop(
-    model: ObjectModel, out: Path, place: Placement | None = None, more: Mapping[str, Any] | None = None
-) -> None:
-    """Write a mesh in mm, its origin in the centre of its box, with its entry in `models_info.json` in the same folder.
+def write_bop(model: ObjectModel, out: Path, place: Placement, more: Mapping[str, Any] | None = None) -> None:
+    """Write a mesh in mm with its entry in `models_info.json` in the same folder; entries of other objects stay.
 
-    The entry has the diameter and the box as BOP defines them, and `origin_m`: where in the object frame of the run the
-    model's origin lies. Entries of other objects stay.
+    The entry has the diameter and the box as BOP defines them, and `object_from_mesh` (16, row by row, m), which takes
+    the mesh to the object frame of the run.
 
     Args:
         model: the mesh, in the object frame.
-        place: another frame; its `object_from_mesh` (16, row by row, m) is then in the entry.
-        more: further values of the entry.
         out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
+        place: the frame to write it in; BOP's own has the origin in the centre of the box and z up.
+        more: further values of the entry.
 
     Raises:
         InputError: if the name is not that of a PLY file, or a file cannot be read or written.
@@ -46,13 +43,7 @@ def write_bop(
         raise InputError(f"{out}: BOP models are PLY files; choose a name such as obj_000001.ply")
     digits = re.search(r"(\d+)$", out.stem)
     number = str(int(digits.group(1))) if digits else "1"
-    if place is None:
-        origin_m = 0.5 * (model.vertices_m.min(axis=0) + model.vertices_m.max(axis=0))
-        where = {"origin_m": origin_m.tolist()}
-        model = replace(model, vertices_m=model.vertices_m - origin_m)
-    else:
-        where = {"object_from_mesh": place.object_from_mesh.ravel().tolist()}
-        model = place.placed(model)
+    model = place.placed(model)
     places_mm = 1000.0 * model.vertices_m
     path = out.with_name(MODELS_INFO)
     entries = _entries(path)
@@ -62,7 +53,7 @@ def write_bop(
         **{f"min_{axis}": float(value) for axis, value in zip("xyz", low_mm, strict=True)},
         **{f"size_{axis}": float(value) for axis, value in zip("xyz", size_mm, strict=True)},
         **(more or {}),
-        **where,
+        "object_from_mesh": place.object_from_mesh.ravel().tolist(),
     }
     write_atomically(out, ply_bytes(places_mm, model.vertex_normals, model.vertex_colours, model.triangles))
     write_atomically(path, json.dumps(dict(sorted(entries.items(), key=lambda entry: int(entry[0]))), indent=2) + "\n")

@@ -6,7 +6,7 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -140,32 +140,43 @@ def _obj(model: ObjectModel, name: str, texture: Texture | None, header: str) ->
 
 
 def _glb(model: ObjectModel, texture: Texture | None, object_from_upright: Array | None) -> bytes:
+    """Return a GLB file: one matt material, and the texture or, as glTF has them, linear colours of vertices."""
     import trimesh
     from PIL import Image
     from trimesh.exchange import gltf
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    mesh = trimesh.Trimesh(
-        model.vertices_m,
-        model.triangles,
-        vertex_normals=model.vertex_normals,
-        vertex_colors=None if texture is not None else model.vertex_colours,
-        process=False,
-    )
+    mesh = trimesh.Trimesh(model.vertices_m, model.triangles, vertex_normals=model.vertex_normals, process=False)
+    material = PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
     if texture is not None:
-        material = PBRMaterial(
-            baseColorTexture=Image.fromarray(texture.image), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
-        )
-        mesh.visual = TextureVisuals(uv=texture.uv, material=material)
+        material.baseColorTexture = Image.fromarray(texture.image)
+    elif model.vertex_colours is not None:
+        mesh.vertex_attributes["_COLOR_0"] = linear_rgb(model.vertex_colours).astype(np.float32)
+    mesh.visual = TextureVisuals(uv=None if texture is None else texture.uv, material=material)
     scene = trimesh.Scene()
     turn = np.diag([1.0, -1.0, -1.0, 1.0])  # glTF: y up, and the front towards +z
     if object_from_upright is not None:
         turn[:3, :3] @= object_from_upright.T
     scene.add_geometry(mesh, transform=turn)
-    data = gltf.export_glb(scene, include_normals=True)
+    data = gltf.export_glb(scene, include_normals=True, tree_postprocessor=_with_colours)
     assert isinstance(data, bytes)
     return data
+
+
+def _with_colours(tree: dict[str, Any]) -> None:
+    """Make the attribute `_COLOR_0` of a glTF tree its colours; the library would round them to 8 bits."""
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            attributes = primitive["attributes"]
+            if "_COLOR_0" in attributes:
+                attributes["COLOR_0"] = attributes.pop("_COLOR_0")
+
+
+def linear_rgb(colours: npt.NDArray[np.uint8]) -> Array:
+    """Return linear intensities (n, 3), 0 to 1, of sRGB colours (n, 3) (IEC 61966-2-1)."""
+    shares = colours / 255.0
+    return np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
 
 
 def _stl(model: ObjectModel, unit: str) -> bytes:

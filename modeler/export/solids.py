@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from modeler.export.files import write_atomically
 from modeler.export.mesh import simplified
+from modeler.system.extras import install_command
 from modeler.types import Array, InputError, ObjectModel
 
 HULL_TRIANGLES = 500
@@ -89,8 +90,7 @@ def convex_parts(model: ObjectModel, seed: int = 0) -> ConvexParts:
     """
     if importlib.util.find_spec("coacd") is None:
         hull = _hull(model.vertices_m)
-        how = "pip install -c constraints.txt -e '.[physics]'"
-        return ConvexParts((hull,), f"one convex hull, as CoACD is not installed ({how})")
+        return ConvexParts((hull,), f"one convex hull, as CoACD is not installed ({install_command('physics')})")
     import coacd  # pyright: ignore[reportMissingImports]
 
     coacd.set_log_level("error")

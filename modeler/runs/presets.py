@@ -19,18 +19,17 @@ from modeler import se3
 from modeler.export import bop, solids
 from modeler.export.mesh import TRIANGLES, Texture
 from modeler.export.placing import model_up
-from modeler.export.solids import triangle_areas
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
+from modeler.runs.checks import Checks, loaded, mesh_checks
 from modeler.runs.outputs import check_files, check_folder, run_inputs
 from modeler.runs.reopening import Reopened, reopened
 from modeler.sequences import finest_unit_mm, write_bop
 from modeler.types import Array, InputError, ObjectModel
 
-_FILES: Final = {"foundationpose": ".obj", "print": ".stl"}
+_MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}
 _PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices carry the colours
 _DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
 _LEAST_FOOTPRINT: Final = 0.02  # of the box: a smaller footprint is not a flat bottom
-
 
 Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
 """Programs for which there are presets."""
@@ -43,7 +42,7 @@ class Preset:
     run_folder: Path
     """The run."""
     out: Path
-    """File or folder to write."""
+    """Folder to write."""
     purpose: Purpose
     """Which program it is for."""
     say: Callable[[str], None]
@@ -70,19 +69,18 @@ class Preset:
             InputError: if something cannot be read or written.
         """
         inputs = run_inputs([self.run_folder], self.sequences)
-        if self.purpose in _FILES:
-            if self.out.suffix.lower() != _FILES[self.purpose]:
-                raise InputError(
-                    f"{self.out}: `purpose` {self.purpose} writes {_FILES[self.purpose]}; give `out` such a suffix"
-                )
-        else:
-            check_folder(self.out, inputs)
-            if os.path.lexists(self.out) and not self.out.is_dir():
-                raise InputError(f"{self.out}: is not a folder; choose another `out`")
+        check_folder(self.out, inputs)
+        if self.out.suffix.lower() in files.FORMATS:
+            raise InputError(f"{self.out}: `purpose` {self.purpose} writes a folder; give `out` a name without suffix")
+        if os.path.lexists(self.out) and not self.out.is_dir():
+            raise InputError(f"{self.out}: is not a folder; choose another `out`")
+        check_files(self._outs(textured=True), inputs, overwrite=self.overwrite)
+        scenes = self.out / "onboarding_static"
+        if self.purpose == "bop" and scenes.exists() and (not scenes.is_dir() or any(scenes.iterdir())):
+            raise InputError(f"{scenes}: exists already; remove it or give another `out`")
         report = files.RunFolder(self.run_folder).result()
         if not report.get("poses"):
             raise InputError(f"{self.run_folder}: no frame of this run was accepted; report.json says why")
-        check_files(self._outs(textured=True), inputs, overwrite=self.overwrite)
         match self.purpose:
             case "foundationpose":
                 return self._foundationpose()
@@ -97,15 +95,19 @@ class Preset:
 
     def _outs(self, *, textured: bool) -> tuple[Path, ...]:
         """Return the files to write, except convex parts and scenes, whose number is unknown before."""
-        out = self.out
         if self.purpose == "bop":
             return (self._bop_model, self._bop_model.with_name(bop.MODELS_INFO))
-        if self.purpose in _FILES:
-            meshes = files.files_of(out, textured=textured and self.purpose == "foundationpose")
-            return (*meshes, files.pose_file(out))
-        of = solids.PhysicsFiles(out, textured)
+        if self.purpose in _MESHES:
+            meshes = files.files_of(self._mesh, textured=textured and self.purpose == "foundationpose")
+            return (*meshes, files.pose_file(self._mesh))
+        of = solids.PhysicsFiles(self.out, textured)
         model = (of.mjcf, of.scene) if self.purpose == "mujoco" else (of.urdf,)
         return (*model, *files.files_of(of.visual, textured=textured), files.pose_file(of.visual), of.part(0))
+
+    @property
+    def _mesh(self) -> Path:
+        """The mesh of a preset that writes only one."""
+        return self.out / _MESHES[self.purpose]
 
     @cached_property
     def _reopened(self) -> Reopened:
@@ -137,7 +139,7 @@ class Preset:
         return files.textured(model, self._volume.texture_colours, self.texture_px)
 
     def _foundationpose(self) -> Checks:
-        out = self.out
+        out = self._mesh
         model, texture = self._coloured(self._model(watertight=False))
         place = files.placement(model, self._reopened.report, "bbox", "z")
         files.write_mesh(place.placed(model), out, texture, axes=place.axes)
@@ -156,7 +158,7 @@ class Preset:
         )
 
     def _print(self) -> Checks:
-        out = self.out
+        out = self._mesh
         model = self._model(watertight=True)
         if self.triangles is not None:
             model = files.simplified(model, self.triangles)
@@ -242,10 +244,6 @@ class Preset:
             f"obj_000001_{side}": {frame: run.views[frame] for frame in frames}
             for side, frames in self._sides().items()
         }
-        for name in scenes:
-            folder = out / "onboarding_static" / name
-            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-                raise InputError(f"{folder}: exists already; remove it or give another `out`")
         model = self._model(watertight=False)
         if self.triangles is not None:
             model = files.simplified(model, self.triangles)
@@ -330,73 +328,3 @@ def _quiet() -> Iterator[None]:
         os.dup2(kept, 1)
         os.close(kept)
         os.close(nowhere)
-
-
-SMALLEST_M: Final = 1e-3
-LARGEST_M: Final = 10.0
-"""An object of the hand or of the table has a size between these; of another size, the unit is wrong."""
-
-
-@dataclass(frozen=True)
-class Checks:
-    """Statements about a file, and which of them do not hold."""
-
-    held: tuple[str, ...] = ()
-    """Passed checks, in words."""
-    failed: tuple[str, ...] = ()
-    """Failed checks, in words."""
-
-    def also(self, holds: bool, words: str, otherwise: str = "") -> Checks:
-        """Return the checks with one more: `words` where it holds, else `otherwise`, or `not` and the words."""
-        if holds:
-            return Checks((*self.held, words), self.failed)
-        return Checks(self.held, (*self.failed, otherwise or f"not {words}"))
-
-    def attempt(self, what: Callable[[], tuple[bool, str]], absent: str) -> Checks:
-        """Return the checks with that of a program, if installed.
-
-        Args:
-            what: returns whether it passes, and words; ValueError if the program rejects the file.
-            absent: words if the program is not installed.
-        """
-        try:
-            return self.also(*what())
-        except ImportError:
-            return Checks((*self.held, absent), self.failed)
-        except ValueError as error:
-            return Checks(self.held, (*self.failed, " ".join(str(error).split())))
-
-    @property
-    def words(self) -> str:
-        """All of it in one line."""
-        failed = f"; FAILED: {'; '.join(self.failed)}" if self.failed else ""
-        return f"checked: {', '.join(self.held)}{failed}"
-
-
-def loaded(path: Path) -> Any:
-    """Return the one mesh in a file as trimesh reads it, corners at one place merged where the format keeps none."""
-    import trimesh
-
-    return trimesh.load_mesh(path, process=path.suffix.lower() == ".stl")
-
-
-def mesh_checks(path: Path, *, unit_m: float = 1.0, most_triangles: int) -> Checks:
-    """Return checks that every exported mesh has to pass: size, number and area of its triangles.
-
-    Args:
-        path: the mesh.
-        unit_m: length of its unit.
-        most_triangles: that the program it is for takes.
-    """
-    mesh = loaded(path)
-    corners, triangles = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    size_m = unit_m * np.ptp(corners, axis=0)
-    flat = int(np.count_nonzero(triangle_areas(corners, triangles) * unit_m**2 <= 1e-14))
-    unit = "m" if unit_m == 1.0 else "mm"
-    size = " x ".join(f"{length:.3g}" for length in size_m / unit_m)
-    return (
-        Checks()
-        .also(bool(SMALLEST_M < size_m.max() < LARGEST_M), f"{size} {unit}", f"a size of {size} {unit} is implausible")
-        .also(len(triangles) <= most_triangles, f"{len(triangles)} triangles", f"{len(triangles)} triangles: too many")
-        .also(not flat, "none degenerate", f"{flat} degenerate triangles")
-    )
