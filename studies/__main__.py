@@ -37,6 +37,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "loops.covariances": ("covariances of whole runs against the truth", "hours"),
     "loops.focal_lengths": ("focal lengths estimated from loops", "minutes"),
     "loops.memory": ("memory and time of builds of thousands of frames", "minutes to hours"),
+    "multiplied": ("models of real captures changed in the ways that people change theirs", "an hour a core"),
     "numbers": ("named numbers of the package by room", "seconds"),
     "results": ("write the tables of pages from the files that hold them", "a second"),
     "same_bytes": ("results of this tree and of another commit, byte by byte", "minutes"),
