@@ -63,6 +63,7 @@ if TYPE_CHECKING:
         Verdict,
     )
     from modeler.views import Sensor
+    from modeler.viz.stream import open_stream
 
 _MODULES = {
     "modeler.api": ("Result", "build", "register"),
@@ -94,6 +95,7 @@ _MODULES = {
         "Verdict",
     ),
     "modeler.sequences": ("open_sequence",),
+    "modeler.viz.stream": ("open_stream",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -124,6 +126,7 @@ __all__ = [
     "VisibilityRegistrar",
     "build",
     "open_sequence",
+    "open_stream",
     "register",
 ]
 

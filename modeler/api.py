@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -14,19 +15,32 @@ import numpy.typing as npt
 from modeler.composition import compose
 from modeler.composition.compose import comes_back
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
-from modeler.export import RunFolder, RunMeta, locked
+from modeler.export import RunFolder, RunMeta, locked, report_of
+from modeler.graph import PoseGraph
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.runs.outputs import check_run_folder
-from modeler.sequences import AbstractSequence
-from modeler.sequences import open_sequence as opened
-from modeler.types import AbstractPrior, Camera, Frame, InputError, ObjectModel, Posterior, Solution, Step, Verdict
+from modeler.segmentation import Segmenter
+from modeler.sequences import AbstractSequence, GivenSequence, KeptSequence, open_sequence
+from modeler.types import (
+    AbstractPrior,
+    AbstractRegistrar,
+    Event,
+    Frame,
+    InputError,
+    Intrinsics,
+    ObjectModel,
+    Posterior,
+    Solution,
+    Step,
+    Verdict,
+)
 from modeler.views import Sensor
 from modeler.viz.stream import open_stream
 
-Intrinsics = Camera | npt.ArrayLike
-"""A camera, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix."""
+Sink = Callable[[Event], object]
+"""Consumes the events of a run: a `Step` for each frame, and others in between."""
 
 
 @final
@@ -36,14 +50,16 @@ class Result:
 
     model: ObjectModel | None
     """The fused object; None if no frame shows it."""
+    graph: PoseGraph
+    """Every edge, accepted or not."""
     solution: Solution
     """object_from_camera (4, 4) by frame number, with covariances."""
     verdict: Verdict
     """Whether the model can be trusted, why not, and the checks behind that."""
     report: Mapping[str, Any]
     """As in report.json: every frame, every edge, the verdict."""
-    folder: Path
-    """The run folder."""
+    folder: Path | None
+    """The run folder, if one was made."""
 
     @property
     def trustworthy(self) -> bool:
@@ -79,29 +95,18 @@ def register(
     Raises:
         InputError: if an image cannot be used, shows no object, or lacks what the prior needs.
     """
-    pictures = [_numbers("depth image", depth).astype(np.float32) for depth in (source_depth_m, target_depth_m)]
-    if pictures[0].ndim != 2 or pictures[0].shape != pictures[1].shape or not pictures[0].size:
-        shapes = " and ".join(str(picture.shape) for picture in pictures)
-        raise InputError(f"the depth images have shapes {shapes}; give two arrays (h, w) of the same camera")
     for name, images in (("masks", masks), ("colours", colours)):
-        if images is not None and len(images) != len(pictures):
+        if images is not None and len(images) != 2:
             raise InputError(f"there are {len(images)} {name} for two depth images; give one for each")
-    given = [None, None] if masks is None else [_numbers("mask", mask) for mask in masks]
-    if any(mask is not None and (mask.shape != pictures[0].shape or np.isnan(mask).any()) for mask in given):
-        raise InputError(f"the masks hold NaN, or have another shape than depth's {pictures[0].shape}; correct them")
-    rgb = [None, None] if colours is None else [np.asarray(colour) for colour in colours]
-    for colour in rgb:
-        if colour is not None and (colour.shape != (*pictures[0].shape, 3) or colour.dtype != np.uint8):
-            raise InputError(
-                f"colours have shape {colour.shape} of {colour.dtype}; give 8-bit RGB of depth's {pictures[0].shape}"
-            )
-    camera = _camera(intrinsics, pictures[0].shape)
-    frames = []
-    for index, (depth_m, mask, colour) in enumerate(zip(pictures, given, rgb, strict=True)):
-        depth_m[~(depth_m > 0.0) | np.isinf(depth_m)] = np.nan
-        frames.append(
-            Frame(index, float(index), depth_m, camera, mask=None if mask is None else mask != 0, colour=colour)
-        )
+    depths_m, none = (source_depth_m, target_depth_m), (None, None)
+    arrays = zip(depths_m, none if masks is None else masks, none if colours is None else colours, strict=True)
+    frames = [
+        Frame.of(depth_m, intrinsics, index, mask=mask, colour=colour)
+        for index, (depth_m, mask, colour) in enumerate(arrays)
+    ]
+    shapes = [frame.depth_m.shape for frame in frames]
+    if shapes[0] != shapes[1]:
+        raise InputError(f"the depth images have shapes {shapes[0]} and {shapes[1]}; give two of the same camera")
     registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colours is not None))
     modeler = Modeler(sensor=sensor or Sensor(), prior=AutoPrior(), registrar=registrar, seed=seed)
     scene = modeler.segmenter.scene(frames)
@@ -116,88 +121,104 @@ def register(
 
 
 def build(
-    sequence: str | Path | AbstractSequence,
-    out: str | Path,
+    sequence: str | Path | Iterable[Frame],
+    out: str | Path | None = None,
     *,
     prior: AbstractPrior | str | None = None,
+    sensor: Sensor | None = None,
+    segmenter: Segmenter | None = None,
+    registrar: AbstractRegistrar | None = None,
+    sinks: Sequence[Sink] = (),
+    live: bool = False,
     seed: int = 0,
     overwrite: bool = False,
 ) -> Result:
-    """Build the model of an object from a sequence into a run folder, as `modeler build` does.
+    """Build the model of an object, into a run folder if one is given, as `modeler build` does.
 
     Args:
-        sequence: a path in any format that `modeler build` reads, or an open sequence, with frames selected or not.
-        out: the run folder to create: mesh, cloud, trajectory, graph, report and recording.
+        sequence: a path in any format that `modeler build` reads, an open sequence, with frames selected or not, or any
+            iterable of frames, such as a generator of `Frame.of(depth_m, intrinsics, number)`.
+        out: the run folder to create: mesh, cloud, trajectory, graph, report and recording; None: none.
         prior: of the motion between frames, or its name in `modeler build`; None: that of the sequence, else `auto`.
+        sensor: noise of the camera; None: that of the sequence, else the first Kinect's.
+        segmenter: finds the object in frames without masks; None: the usual one.
+        registrar: registers two views; None: the usual method.
+        sinks: called with every event of the run, such as one of `open_stream`, which shows the run in Rerun, or a
+            function of your own.
+        live: whether the frames of an iterable are still being taken: each is processed before the next one is asked
+            for, and the scene is learned from the first three. Otherwise all are read first, and kept in memory.
         seed: of every random number; the same seed gives the same model.
         overwrite: replace the results of an earlier run in the folder.
 
     Raises:
         InputError: if the sequence cannot be read, or the folder cannot be used.
     """
-    began_s = time.perf_counter()
-    frames = sequence if isinstance(sequence, AbstractSequence) else opened(Path(sequence))
-    named = () if isinstance(sequence, AbstractSequence) else (Path(sequence),)
-    check_run_folder(Path(out), (*named, *frames.inputs), overwrite=overwrite)
-    options = PriorOptions(prior=prior if isinstance(prior, str) else None)
-    modeler = compose.modeler(frames, options, MethodOptions(seed=seed), ObjectOptions())
-    if isinstance(prior, AbstractPrior):
-        modeler = replace(modeler, prior=prior)
+    began_s, folder = time.perf_counter(), None if out is None else Path(out)
+    inputs: tuple[Path, ...] = ()
+    if isinstance(sequence, str | Path):
+        inputs = (Path(sequence),)
+    elif isinstance(sequence, AbstractSequence):
+        inputs = sequence.inputs
+    if folder is not None:
+        check_run_folder(folder, inputs, overwrite=overwrite)
+    frames = _opened(sequence, live=live)
+    options = compose.options_of(prior) if isinstance(prior, AbstractPrior) else PriorOptions(prior=prior)
+    named = PriorOptions() if isinstance(prior, AbstractPrior) else options
+    modeler = compose.modeler(frames, named, MethodOptions(seed=seed), ObjectOptions())
+    modeler = replace(
+        modeler,
+        prior=prior if isinstance(prior, AbstractPrior) else modeler.prior,
+        sensor=sensor or modeler.sensor,
+        segmenter=segmenter or modeler.segmenter,
+        registrar=registrar or modeler.registrar,
+    )
+    settings = {"prior_args": options.prior_args, "roi": modeler.segmenter.roi}
+    settings |= {"max_depth_m": modeler.segmenter.max_depth_m}
     meta = RunMeta(
-        sequence=frames.name if isinstance(sequence, AbstractSequence) else str(sequence),
+        sequence=str(inputs[0]) if inputs else frames.name,
         seed=seed,
-        prior=type(prior).__name__ if isinstance(prior, AbstractPrior) else compose.resolved_prior(options, frames)[0],
+        prior=compose.resolved_prior(options, frames)[0],
+        settings={name: value for name, value in settings.items() if value not in (None, ())},
     )
     closure_expected = comes_back(frames, modeler.prior, modeler.closer.max_angle_deg)
     scene = compose.scene(modeler, frames)
-    report: Mapping[str, Any] = {}
     last: Step | None = None
-    with locked(Path(out)):
-        folder = RunFolder.open(Path(out), overwrite=overwrite)
-        facts = {"sequence": meta.sequence, "seed": seed, "prior": meta.prior}
-        stream = open_stream(frames.name, save=folder.path / "recording.rrd", facts=facts)
-        try:
-            for event in modeler.run(frames, scene, closure_expected=closure_expected):
-                if isinstance(event, Step):
-                    seconds = {"total": time.perf_counter() - began_s}
-                    report = folder.write(event, replace(meta, seconds=seconds))
-                    stream(event)
-                    last = event
-        finally:
-            stream.close()
-        folder.finish()
+    with nullcontext() if folder is None else _recorded(folder, meta, frames.name, began_s, overwrite) as record:
+        for event in modeler.run(frames, scene, closure_expected=closure_expected, live=frames.live):
+            if isinstance(event, Step):
+                event.solution.covariances.values()  # in every run: the first request decides the last digits of others
+                last = event
+            for sink in (*([record] if record else []), *sinks):
+                sink(event)
     if last is None or last.verdict is None:
         raise InputError(f"{frames.name}: has no selected frame; select others")
-    return Result(last.model, last.solution, last.verdict, report, folder.path)
+    report = report_of(last, meta) if folder is None else RunFolder(folder).report()
+    return Result(last.model, PoseGraph(last.edges_so_far), last.solution, last.verdict, report, folder)
 
 
-def _numbers(name: str, image: npt.ArrayLike) -> np.ndarray:
-    """Return an image as an array of its own.
-
-    Raises:
-        InputError: if it is none of real numbers.
-    """
-    try:
-        array = np.array(image)
-    except ValueError as error:  # rows of different lengths
-        raise InputError(f"a {name} is no array ({error}); give one of numbers") from None
-    if array.dtype.kind not in "fiub":
-        raise InputError(f"a {name} is of {array.dtype}; give real numbers")
-    return array
-
-
-def _camera(intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
-    """Return the camera of images of a shape (h, w).
+def _opened(sequence: str | Path | Iterable[Frame], *, live: bool) -> AbstractSequence:
+    """Return what frames are read from.
 
     Raises:
-        InputError: if the intrinsics are invalid.
+        InputError: if nothing can be.
     """
-    height, width = shape
-    if isinstance(intrinsics, Camera):
-        return intrinsics
-    numbers = _numbers("camera", intrinsics).astype(np.float64)
-    if numbers.shape == (3, 3):
-        numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
-    if numbers.shape != (4,) or not np.isfinite(numbers).all() or not (numbers[:2] > 0.0).all():
-        raise InputError("the intrinsics are invalid; give (fx, fy, cx, cy) in px, or the (3, 3) camera matrix")
-    return Camera(width, height, *(float(number) for number in numbers))
+    if isinstance(sequence, str | Path):
+        return KeptSequence(open_sequence(Path(sequence)))
+    return sequence if isinstance(sequence, AbstractSequence) else GivenSequence.of(sequence, live=live)
+
+
+@contextmanager
+def _recorded(out: Path, meta: RunMeta, name: str, began_s: float, overwrite: bool) -> Iterator[Sink]:
+    """Make a run folder with a recording, and yield the sink that fills it."""
+    with locked(out):
+        folder = RunFolder.open(out, overwrite=overwrite)
+        facts = {"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings}
+        with closing(open_stream(name, save=out / "recording.rrd", facts=facts)) as stream:
+
+            def record(event: Event) -> None:
+                if isinstance(event, Step):
+                    folder.write(event, replace(meta, seconds={"total": time.perf_counter() - began_s}))
+                    stream(event)
+
+            yield record
+        folder.finish()

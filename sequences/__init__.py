@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from modeler.sequences.base import AbstractSequence as AbstractSequence
+from modeler.sequences.base import GivenSequence as GivenSequence
 from modeler.sequences.base import KeptSequence as KeptSequence
 from modeler.sequences.base import frame_range as frame_range
 from modeler.sequences.bop import BopSequence as BopSequence

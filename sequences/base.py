@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import final
+from typing import Final, final
 
 from modeler.types import Array, Frame, InputError, SensorNoise
+
+FIRST: Final = 3
+"""Frames of a live source to wait for before the scene is learned from them."""
 
 
 class AbstractSequence(ABC):
@@ -230,6 +234,90 @@ class SelectedSequence(AbstractDerived):
         """Return the true camera_from_model (4, 4) by frame number; None if it is not known."""
         truth = self.whole.truth()
         return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class GivenSequence(AbstractSequence):
+    """Frames that a program gives: those that it has given, and, from a live source, those to come."""
+
+    given: tuple[Frame, ...]
+    """In order of time."""
+    coming: Iterator[Frame] | None = None
+    """Yields the rest, once; None: there is none."""
+
+    @classmethod
+    def of(cls, frames: Iterable[Frame], *, live: bool) -> GivenSequence:
+        """Return the sequence of an iterable.
+
+        Args:
+            frames: in order of time.
+            live: take only the first frames, from which the scene is learned, and each other one when it is asked for.
+
+        Raises:
+            InputError: if there is none, one is no frame, or their numbers do not ascend.
+        """
+        coming = _checked(frames)
+        given = tuple(itertools.islice(coming, FIRST if live else None))
+        if not given:
+            raise InputError("there is no frame; give at least one")
+        return cls(given, coming if live else None)
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return "frames"
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Numbers of the frames that were given."""
+        return tuple(frame.index for frame in self.given)
+
+    @property
+    def live(self) -> bool:
+        """Whether more frames come."""
+        return self.coming is not None
+
+    def frame(self, index: int) -> Frame:
+        """Return one of the frames that were given."""
+        for frame in self.given:
+            if frame.index == index:
+                return frame
+        raise InputError(f"frame {index} is not kept; there are {span(self.indices)}.")
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames that were given and then, once, those to come."""
+        return itertools.chain(self.given, self.coming or ())
+
+    def truth(self) -> dict[int, Array] | None:
+        """Return None: it is not known."""
+        return None
+
+    def sensor(self) -> SensorNoise | None:
+        """Return None: unknown."""
+        return None
+
+    @property
+    def motion(self) -> None:
+        """None: nothing is known."""
+        return None
+
+
+def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Yield frames of ascending numbers.
+
+    Raises:
+        InputError: if one is no frame, or its number is not greater than the one before.
+    """
+    last = None
+    for frame in frames:
+        if not isinstance(frame, Frame):
+            kind = type(frame).__name__
+            raise InputError(f"the sequence yields a {kind} where a frame is wanted; make it with modeler.Frame.of")
+        if last is not None and frame.index <= last:
+            raise InputError(f"frame {frame.index} comes after frame {last}; number frames in order of time")
+        last = frame.index
+        yield frame
 
 
 @final

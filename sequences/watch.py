@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
-from modeler.sequences.base import AbstractDerived, AbstractSequence, check_every
+from modeler.sequences.base import FIRST, AbstractDerived, AbstractSequence, check_every
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.opening import open_sequence
 from modeler.sequences.survey import survey
@@ -34,7 +34,7 @@ class WatchLimits:
     """When nothing has come for so long, the sequence is over."""
     settle_s: float = 0.5
     """The newest frame is taken once the folder has not changed for so long: its colour and mask may come late."""
-    first: int = 3
+    first: int = FIRST
     """Number of frames to wait for before the sequence is described."""
 
 

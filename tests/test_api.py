@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import doctest
+import json
 import os
 import pydoc
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +19,17 @@ import tabletop
 
 import modeler
 from modeler import se3
-from modeler.composition.compose import chosen_prior
+from modeler.composition.compose import chosen_prior, options_of
 from modeler.composition.options import PriorOptions
 from modeler.sequences import bundled
-from modeler.types import Camera
+from modeler.types import AbstractPrior, Camera, Event, Frame, Step
+from studies.loops.known import Known
 
 POSES = tabletop.turntable(15)
 SOURCE, TARGET = (tabletop.view(tabletop.Box((0.06, 0.045, 0.08)), POSES[index], index).frame for index in (1, 0))
 CAMERA = SOURCE.camera
+FRAMES = [tabletop.view(tabletop.Box((0.06, 0.045, 0.08)), POSES[index], index).frame for index in range(4)]
+KNOWN = Known(dict(enumerate(POSES[:4])))
 NUMBERS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
 
 
@@ -117,6 +123,83 @@ def test_a_prior_may_be_named() -> None:
     np.testing.assert_array_equal(one.pose.mean, other.pose.mean)
 
 
+def taken(order: list[str]) -> Iterator[Frame]:
+    for frame in FRAMES:
+        order.append(f"taken {frame.index}")
+        yield frame
+
+
+def told(order: list[str]) -> Callable[[Event], None]:
+    return lambda event: order.append(f"step {event.frame.index}") if isinstance(event, Step) else None
+
+
+def test_frames_of_a_generator_become_a_run_folder_with_a_verdict(tmp_path: Path) -> None:
+    events: list[Event] = []
+    result = modeler.build(taken([]), tmp_path / "run", prior="general", registrar=KNOWN, sinks=[events.append])
+    last = events[-1]
+    assert isinstance(last, Step)
+    assert last.last
+    assert (result.graph.edges, result.verdict) == (last.edges_so_far, last.verdict)
+    assert set(result.solution.trajectory) == {0, 1, 2, 3}
+    assert result.report == json.loads((tmp_path / "run" / "report.json").read_text())
+    assert {"model.ply", "recording.rrd", "graph.g2o"} <= {path.name for path in (tmp_path / "run").iterdir()}
+    alone = modeler.build(FRAMES, prior="general", registrar=KNOWN)
+    assert alone.folder is None
+    assert alone.report["edges"] == result.report["edges"]
+    for frame, pose in result.solution.trajectory.items():
+        np.testing.assert_array_equal(alone.solution.trajectory[frame], pose)
+
+
+def test_a_live_loop_is_asked_for_a_frame_once_the_one_before_is_processed() -> None:
+    live, read = list[str](), list[str]()
+    for order, flag in ((live, True), (read, False)):
+        modeler.build(taken(order), prior="general", registrar=KNOWN, sinks=[told(order)], live=flag)
+    assert live == [
+        *("taken 0", "taken 1", "taken 2"),  # from which the scene is learned
+        *("step 0", "step 1", "step 2", "taken 3", "step 3", "step 3"),
+    ]
+    assert read[:4] == ["taken 0", "taken 1", "taken 2", "taken 3"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "words"),
+    [
+        ([], "no frame"),
+        ([SOURCE.depth_m], r"ndarray where a frame is wanted; make it with modeler\.Frame\.of"),
+        ([SOURCE, TARGET], "frame 0 comes after frame 1"),
+    ],
+)
+def test_what_is_no_sequence_of_frames_is_refused(frames: list[Any], words: str) -> None:
+    with pytest.raises(modeler.InputError, match=words):
+        modeler.build(frames)
+
+
+def test_a_used_folder_is_refused_before_a_frame_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "note.txt").touch()
+    with pytest.raises(modeler.InputError, match="not empty"):
+        modeler.build((pytest.fail("taken") for _ in range(1)), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        modeler.TablePrior(),
+        modeler.TurntablePrior(-25.0, 3.0, axis_direction=(0.0, 1.0, 0.0)),
+        modeler.GeneralPrior(max_rotation_deg=20.0),
+    ],
+)
+def test_a_prior_is_made_again_from_what_a_report_says_of_it(prior: AbstractPrior) -> None:
+    assert chosen_prior(options_of(prior), None) == prior
+
+
+def test_the_tutorial_on_priors_runs() -> None:
+    (tutorial,) = doctest.DocTestFinder(recurse=False).find(AbstractPrior, globs={})
+    said: list[str] = []
+    done = doctest.DocTestRunner().run(tutorial, out=said.append)
+    assert (said, done.failed) == ([], 0)
+    assert done.attempted > 8
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -147,9 +230,9 @@ def test_no_camera_is_without_pixels_or_focal_length(change: dict[str, Any]) -> 
         ({"source_depth_m": np.ones((3, 4))}, "have shapes"),
         ({"intrinsics": (1.0, 2.0)}, "intrinsics"),
         ({"intrinsics": (0.0, 500.0, 10.0, 10.0)}, "intrinsics"),
-        ({"masks": (np.ones((3, 4)), np.ones((3, 4)))}, "masks"),
+        ({"masks": (np.ones((3, 4)), np.ones((3, 4)))}, "a mask"),
         ({"source_depth_m": np.zeros_like(SOURCE.depth_m)}, "source image"),
-        ({"source_depth_m": np.zeros((0, 0)), "target_depth_m": np.zeros((0, 0))}, "have shapes"),
+        ({"source_depth_m": np.zeros((0, 0)), "target_depth_m": np.zeros((0, 0))}, "has shape"),
         ({"source_depth_m": [[1.0], [1.0, 2.0]]}, "is no array"),
         ({"source_depth_m": SOURCE.depth_m.astype(complex)}, "complex"),
         ({"intrinsics": Camera(64, 48, *NUMBERS)}, "its camera has"),
@@ -158,6 +241,7 @@ def test_no_camera_is_without_pixels_or_focal_length(change: dict[str, Any]) -> 
         ({"masks": (np.full(SOURCE.depth_m.shape, np.nan), TARGET.mask)}, "NaN"),
         ({"masks": ("mask", "mask")}, "real numbers"),
         ({"colours": (np.zeros((*SOURCE.depth_m.shape, 4), np.uint8),) * 2}, "colours"),
+        ({"source_depth_m": 1000.0 * SOURCE.depth_m}, "not in mm"),
         ({"colours": (SOURCE.colour,)}, "1 colours for two"),
         ({"seed": -1}, "negative"),
         ({"prior": "tabel"}, "unknown prior"),

@@ -167,7 +167,9 @@ def test_what_a_page_says_works(at_desk: Desk, name: str) -> None:
 def test_the_python_of_the_guide_works(at_desk: Desk) -> None:
     names = tried(at_desk, "python")
     assert names["posterior"].outcome is Outcome.CONVERGED
-    assert (names["result"].folder / "model.ply").exists()
+    own = names["frames"]
+    assert [frame.index for frame in own()] == [0, 1, 2]
+    assert (Path("runs/own-frames/report.json").exists(), Path("runs/box.rrd").exists()) == (True, True)
     assert set(names["smoother"].solution.trajectory) == {0, 1, 2}
 
 

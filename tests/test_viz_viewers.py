@@ -440,5 +440,5 @@ def test_the_notebook_runs_and_embeds_the_viewer(monkeypatch: pytest.MonkeyPatch
         exec(cell.replace(whole, f"{whole}.select(frames=slice(0, 3))"), names)
     (frame,) = shown
     assert frame.src.startswith("http://127.0.0.1:")
-    assert len(names["step"].views) == 3
+    assert len(names["result"].solution.trajectory) == 3
     assert names["stream"].viewers[0].process.poll() is not None

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from modeler.system.processes import check_room
-from modeler.types import InputError, Step
+from modeler.types import Event, InputError, Step
 from modeler.viz import entities, viewer
 from modeler.viz.destinations import RecordingFile, Shown
 
@@ -53,9 +53,9 @@ class RerunStream:
         """The address to open: the page in the browser, else the port of the window; None without a viewer."""
         return self.viewers[-1].address if self.viewers else None
 
-    def __call__(self, step: Step) -> None:
-        """Draw a step."""
-        if not self.drawn:
+    def __call__(self, step: Event) -> None:
+        """Draw an event of a run. Only steps are drawn."""
+        if not (isinstance(step, Step) and self.drawn):
             return
         # Rerun takes half a second to import: only runs that record pay for it.
         from modeler.viz import graph_view, images, model_view, pair_view, readings

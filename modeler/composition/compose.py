@@ -323,6 +323,26 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
     return prior
 
 
+def options_of(prior: AbstractPrior) -> PriorOptions:
+    """Return the options by which a run's prior can be made again, if its module can be imported.
+
+    Fields that are other objects, such as priors of a product, are left out.
+    """
+    known = fields(prior) if is_dataclass(prior) else ()
+    given = {field.name: getattr(prior, field.name) for field in known if field.init}
+    usual = {field.name: field.default for field in known}
+    words = tuple(f"{name}={value!r}" for name, value in given.items() if _literal(value) and value != usual[name])
+    return PriorOptions(prior=f"{type(prior).__module__}:{type(prior).__qualname__}", prior_args=words)
+
+
+def _literal(value: object) -> bool:
+    """Return whether a value can be read from what it is printed as."""
+    try:
+        return bool(ast.literal_eval(repr(value)) == value)
+    except (ValueError, SyntaxError):
+        return False
+
+
 def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPrior:
     """Return a proposal within a known prior."""
     return VelocityPrior(known, **given) if name == "velocity" else FeaturesPrior(known)

@@ -104,22 +104,24 @@ class Modeler:
         *,
         closure_expected: bool = False,
         depth_scale_sigma: float = 0.0,
+        live: bool = False,
     ) -> Iterator[Event]:
         """Build a model and yield events: for each frame a `Step`, the last of which has the final model and verdict.
 
         To skip or shorten the refinement, iterate over the phases of `start(scene)` instead.
 
         Args:
-            frames: in order of time; read one ahead, because the last frame is always compared with the first.
+            frames: in order of time; unless `live`, read one ahead: the last frame is always compared with the first.
             scene: as the segmenter estimated it from the sequence.
             closure_expected: whether the object is known to come back to its start.
             depth_scale_sigma: standard deviation of the depth scale's logarithm; 0 = exact.
+            live: process each frame before the next one is read, which may only come later.
 
         Raises:
             InputError: if two frames have the same number.
         """
         run = self.start(scene, closure_expected=closure_expected, depth_scale_sigma=depth_scale_sigma)
-        yield from run.track(frames)
+        yield from run.track(frames, live=live)
         yield from run.revisit()
         yield from run.rejoin()
         yield from run.refine()

@@ -3,6 +3,8 @@
 from modeler.priors.general import AnyMotion as AnyMotion
 from modeler.priors.general import GeneralPrior as GeneralPrior
 from modeler.priors.held import HeldPrior as HeldPrior
+from modeler.priors.mixtures import Gaussian as Gaussian
+from modeler.priors.mixtures import defensive_mixture as defensive_mixture
 from modeler.priors.poke import Poke as Poke
 from modeler.priors.poke import PokePrior as PokePrior
 from modeler.priors.product import AutoPrior as AutoPrior

@@ -70,6 +70,7 @@ from modeler.types.views import NOMINAL_FOCAL as NOMINAL_FOCAL
 from modeler.types.views import Camera as Camera
 from modeler.types.views import Frame as Frame
 from modeler.types.views import HandPoses as HandPoses
+from modeler.types.views import Intrinsics as Intrinsics
 from modeler.types.views import Plane as Plane
 from modeler.types.views import RayImage as RayImage
 from modeler.types.views import Segmentation as Segmentation

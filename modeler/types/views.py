@@ -13,6 +13,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.types.base import Array, BoolArray, InputError, Outcome
 
+_FARTHEST_M = 20.0  # that a depth camera for objects measures
 _KINDS = {"f": "floating-point numbers", "b1": "bool", "u1": "8-bit integers"}
 
 
@@ -42,6 +43,22 @@ class Camera:
         if not (self.width > 0 < self.height and self.fx > 0.0 < self.fy and np.isfinite(astuple(self)).all()):
             raise InputError(f"{self} is none; give a size in px, positive focal lengths and a principal point")
 
+    @classmethod
+    def of(cls, intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
+        """Return the camera of images of a shape (h, w).
+
+        Raises:
+            InputError: if the intrinsics are invalid.
+        """
+        if isinstance(intrinsics, Camera):
+            return intrinsics
+        numbers = _numbers("camera", intrinsics).astype(np.float64)
+        if numbers.shape == (3, 3):
+            numbers = numbers[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if numbers.shape != (4,) or not np.isfinite(numbers).all() or not (numbers[:2] > 0.0).all():
+            raise InputError("the intrinsics are invalid; give (fx, fy, cx, cy) in px, or the (3, 3) camera matrix")
+        return cls(shape[1], shape[0], *(float(number) for number in numbers))
+
     def rays(self) -> tuple[Array, Array]:
         """Return w = x/z and h = y/z of every pixel, each (h, w)."""
         w = (np.arange(self.width, dtype=np.float64) - self.cx) / self.fx
@@ -49,9 +66,13 @@ class Camera:
         return np.broadcast_to(w, (self.height, self.width)), np.broadcast_to(h[:, None], (self.height, self.width))
 
 
+Intrinsics = Camera | npt.ArrayLike
+"""A camera, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of the depth camera."""
+    """One image of the depth camera. `Frame.of` makes one from arrays."""
 
     index: int
     """Number of the frame in its sequence."""
@@ -87,6 +108,51 @@ class Frame:
                     f"{expected} of {_KINDS[kind]}; correct one of them"
                 )
 
+    @classmethod
+    def of(
+        cls,
+        depth_m: npt.ArrayLike,
+        intrinsics: Intrinsics,
+        index: int = 0,
+        *,
+        time_s: float | None = None,
+        mask: npt.ArrayLike | None = None,
+        colour: np.ndarray | None = None,
+    ) -> Frame:
+        """Return a frame of copies of arrays.
+
+        Args:
+            depth_m: (h, w) distance along the optical axis in m; 0, NaN or infinite where nothing was measured.
+            intrinsics: a `Camera`, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix.
+            index: number of the frame; numbers ascend with time, by one for each step of a turntable.
+            time_s: time of capture in s; None: the index.
+            mask: (h, w) true on the object; None: not segmented.
+            colour: (h, w, 3) 8-bit RGB, aligned to depth.
+
+        Raises:
+            InputError: if an array cannot be used.
+        """
+        pixels = _numbers("depth image", depth_m).astype(np.float32)
+        if pixels.ndim != 2 or not pixels.size:
+            raise InputError(f"a depth image has shape {pixels.shape}; give an array (h, w)")
+        pixels[~(pixels > 0.0) | np.isinf(pixels)] = np.nan
+        if (measured := pixels[np.isfinite(pixels)]).size and measured.min() > _FARTHEST_M:
+            raise InputError(f"depth is beyond {_FARTHEST_M:g} m everywhere; give it in m, not in mm")
+        region = None if mask is None else _numbers("mask", mask)
+        if region is not None and (region.shape != pixels.shape or np.isnan(region).any()):
+            raise InputError(f"a mask holds NaN, or has another shape than depth's {pixels.shape}; correct it")
+        if colour is not None and (np.shape(colour) != (*pixels.shape, 3) or np.asarray(colour).dtype != np.uint8):
+            what = f"{np.shape(colour)} of {np.asarray(colour).dtype}"
+            raise InputError(f"the colours have shape {what}; give 8-bit RGB of depth's {pixels.shape}")
+        return cls(
+            index,
+            float(index) if time_s is None else time_s,
+            pixels,
+            Camera.of(intrinsics, pixels.shape),
+            mask=None if region is None else region != 0,
+            colour=None if colour is None else np.array(colour),
+        )
+
     @property
     def unoccluded(self) -> Frame:
         """The frame without depth and object at occluders.
@@ -97,6 +163,21 @@ class Frame:
             return self
         depth_m = np.where(self.occluder, np.float32(np.nan), self.depth_m)
         return replace(self, depth_m=depth_m, mask=None if self.mask is None else self.mask & ~self.occluder)
+
+
+def _numbers(name: str, image: npt.ArrayLike) -> np.ndarray:
+    """Return an image as an array of its own.
+
+    Raises:
+        InputError: if it is none of real numbers.
+    """
+    try:
+        array = np.array(image)
+    except ValueError as error:  # rows of different lengths
+        raise InputError(f"a {name} is no array ({error}); give one of numbers") from None
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"a {name} is of {array.dtype}; give real numbers")
+    return array
 
 
 @dataclass(frozen=True, eq=False)
