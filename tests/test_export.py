@@ -18,6 +18,7 @@ from turning_box import steps
 from modeler import se3
 from modeler.export import (
     RunMeta,
+    format_of,
     g2o_text,
     mesh_of,
     model_upright,
@@ -78,6 +79,43 @@ def test_a_glb_is_matt_and_no_metal(tmp_path: Path, coloured: bool) -> None:
     assert (material["metallicFactor"], material["roughnessFactor"]) == (0.0, 1.0)
     assert material.get("baseColorFactor", [1, 1, 1, 1]) == [1, 1, 1, 1]
     assert {*primitive["attributes"]} == {"POSITION", "NORMAL", *(("COLOR_0",) if coloured else ())}
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_3mf_is_read_by_its_library_with_unit_and_colours(tmp_path: Path, coloured: bool) -> None:
+    lib3mf = pytest.importorskip("lib3mf")
+    model, out = ball(coloured=coloured), tmp_path / "ball.3mf"
+    write_mesh(model, out)
+    content = lib3mf.get_wrapper().CreateModel()
+    reader = content.QueryReader("3mf")
+    reader.SetStrictModeActive(True)
+    reader.ReadFromFile(str(out))
+    assert reader.GetWarningCount() == 0
+    assert content.GetUnit() == lib3mf.ModelUnit.Meter
+    objects = content.GetMeshObjects()
+    assert objects.MoveNext()
+    solid = objects.GetCurrentMeshObject()
+    assert solid.IsManifoldAndOriented()
+    places = np.array([tuple(vertex.Coordinates) for vertex in solid.GetVertices()])
+    corners = np.array([tuple(triangle.Indices) for triangle in solid.GetTriangleIndices()])
+    np.testing.assert_allclose(places[corners], model.vertices_m[model.triangles], atol=1e-7)
+    if coloured:
+        assert model.vertex_colours is not None
+        properties = solid.GetAllTriangleProperties()
+        group = content.GetColorGroupByID(properties[0].ResourceID)
+        for corner, found in zip(corners, properties, strict=True):
+            colours = [group.GetColor(number) for number in found.PropertyIDs]
+            told = [(colour.Red, colour.Green, colour.Blue) for colour in colours]
+            np.testing.assert_array_equal(told, model.vertex_colours[corner])
+    before = out.read_bytes()
+    write_mesh(model, out)
+    assert out.read_bytes() == before
+
+
+def test_a_format_whose_library_is_missing_is_said_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"lib3mf is not installed; .* -m pip install 'modeler\[3mf\]'"):
+        format_of(Path("ball.3mf"))
 
 
 def test_trajectory_reads_back_to_the_last_digit() -> None:

@@ -14,7 +14,8 @@ from modeler.composition.options import default
 
 Origin = Literal["camera", "base", "centre", "bbox"]  # spelt out here, for help imports nothing heavy
 Up = Literal["z", "y"]
-Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
+Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print"]
+_BODIES = ("mujoco", "urdf", "isaac", "gazebo")
 
 if TYPE_CHECKING:
     from modeler.export.mesh import Texture
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Write the fused mesh of a run as PLY, OBJ, GLB or STL, in m.
+    """Write the fused mesh of a run as PLY, OBJ, GLB, STL or 3MF, in m.
 
     The centre of its base is the origin and z is up, in GLB y; FILE.pose.json has the pose that maps it back to where
     the first camera saw it. --watertight, --texture and --voxel-m fuse again from the frames, so the sequence must be
@@ -33,12 +34,12 @@ class Export:
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Run folder of `modeler build`."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl} or DIR")]
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.{ply,obj,glb,stl,3mf} or DIR")]
     """File to write; its suffix selects the format. STL has no colour. With --for a folder."""
     purpose: Annotated[Purpose | None, tyro.conf.arg(name="for"), default("none")] = None
     """Write a folder with all files for a program, read them back and check them: foundationpose (OBJ with texture),
-    bop (models and onboarding_static), mujoco and urdf (meshes, convex parts, mass, inertia), print (watertight STL in
-    mm with a flat bottom)."""
+    bop (models and onboarding_static), mujoco, urdf, isaac (OpenUSD) and gazebo (SDF) with mesh, convex parts, mass and
+    inertia, print (watertight STL in mm with a flat bottom)."""
     overwrite: bool = False
     """Replace existing files."""
     origin: Annotated[Origin | None, default("base")] = None
@@ -63,7 +64,7 @@ class Export:
     voxel_m: Annotated[float | None, tyro.conf.arg(metavar="M"), default("from the data")] = None
     """Side of a voxel."""
     density_kg_m3: Annotated[float | None, default("1000, that of water")] = None
-    """Density of the solid, with --for mujoco and urdf."""
+    """Density of the solid, with --for mujoco, urdf, isaac and gazebo."""
     mass_kg: Annotated[float | None, default("from the density")] = None
     """Mass, instead of a density."""
     moved: MovedOptions = field(default_factory=MovedOptions)
@@ -180,7 +181,7 @@ def _check(options: Export) -> None:
     if options.bop and (options.origin or options.up):
         raise InputError("--bop puts the origin in the centre of the box, z up; leave out --origin and --up")
     if options.density_kg_m3 is not None or options.mass_kg is not None:
-        raise InputError("--density-kg-m3 and --mass-kg go with --for mujoco and --for urdf alone")
+        raise InputError(f"--density-kg-m3 and --mass-kg go with --for {', '.join(_BODIES)} alone")
     _check_numbers(options)
 
 
@@ -193,8 +194,8 @@ def _check_preset(options: Export, purpose: Purpose) -> None:
         raise InputError(f"--for {purpose} decides on --{given[0]}; leave it out")
     bodies = {"density-kg-m3": options.density_kg_m3, "mass-kg": options.mass_kg}
     of_bodies = [name for name, value in bodies.items() if value is not None]
-    if of_bodies and purpose not in ("mujoco", "urdf"):
-        raise InputError(f"--{of_bodies[0]} goes with --for mujoco and --for urdf alone")
+    if of_bodies and purpose not in _BODIES:
+        raise InputError(f"--{of_bodies[0]} goes with --for {', '.join(_BODIES)} alone")
 
 
 def _check_numbers(options: Export) -> None:

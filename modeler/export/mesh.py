@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import io
+import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,9 +17,10 @@ from scipy.spatial import KDTree
 from modeler.export.files import write_atomically
 from modeler.export.formats import mesh_ply
 from modeler.export.placing import CAMERA_AXES
+from modeler.system.extras import check_installed
 from modeler.types import Array, InputError, ObjectModel
 
-FORMATS = (".ply", ".obj", ".glb", ".stl")
+FORMATS = (".ply", ".obj", ".glb", ".stl", ".3mf")
 TEXTURED = (".obj", ".glb")
 AS_GIVEN: Final = np.diag([1.0, -1.0, -1.0])
 """For a mesh whose y axis is already up: reverses the rotation to glTF's axes."""
@@ -42,12 +45,14 @@ def format_of(out: Path) -> str:
     """Return the ending that selects the format.
 
     Raises:
-        InputError: if it is none.
+        InputError: if it is none, or the library that writes it is not installed.
     """
     suffix = out.suffix.lower()
     if suffix not in FORMATS:
         what = f"unknown mesh format {suffix!r}" if suffix else "no suffix selects the mesh format"
         raise InputError(f"{out}: {what}; use {', '.join(FORMATS)}")
+    if suffix == ".3mf":
+        check_installed("lib3mf", "lib3mf", "3mf")
     return suffix
 
 
@@ -72,7 +77,7 @@ def write_mesh(
 
     Coordinates stay as they are in every format. In glTF y is up, so that the node of a GLB turns a mesh that is
     given in the camera's axes: viewers show it upright, from the camera's side. PLY, OBJ and GLB keep normals and
-    colours, only PLY has properties of the vertices; STL has neither.
+    colours, 3MF colours, only PLY has properties of the vertices; STL has none of them.
 
     Args:
         model: the mesh.
@@ -99,16 +104,19 @@ def write_mesh(
         case ".obj":
             if texture is not None:
                 _, material, image = files_of(out, textured=True)
-                write_atomically(image, _png(texture))
+                write_atomically(image, png_bytes(texture))
                 write_atomically(material, _material(image.name))
             write_atomically(out, _obj(model, "_".join(out.stem.split()), texture, f"{unit}, {axes}"))
+        case ".3mf":
+            write_atomically(out, _3mf(model, unit))
         case ".glb":
             write_atomically(out, _glb(model, texture, object_from_upright))
         case _:
             write_atomically(out, _stl(model, unit))
 
 
-def _png(texture: Texture) -> bytes:
+def png_bytes(texture: Texture) -> bytes:
+    """Return the image of a texture as PNG."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -177,6 +185,33 @@ def linear_rgb(colours: npt.NDArray[np.uint8]) -> Array:
     """Return linear intensities (n, 3), 0 to 1, of sRGB colours (n, 3) (IEC 61966-2-1)."""
     shares = colours / 255.0
     return np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+
+
+def _3mf(model: ObjectModel, unit: Literal["m", "mm"]) -> bytes:
+    """Return a 3MF file with its unit stated; each corner has its vertex's colour, which 3MF has in sRGB."""
+    import lib3mf  # pyright: ignore[reportMissingImports]
+
+    content: Any = lib3mf.get_wrapper().CreateModel()
+    content.SetUnit(lib3mf.ModelUnit.Meter if unit == "m" else lib3mf.ModelUnit.MilliMeter)
+    solid = content.AddMeshObject()
+    solid.SetGeometry(
+        [lib3mf.Position((ctypes.c_float * 3)(*place)) for place in model.vertices_m.tolist()],
+        [lib3mf.Triangle((ctypes.c_uint32 * 3)(*corners)) for corners in model.triangles.tolist()],
+    )
+    if model.vertex_colours is not None:
+        group = content.AddColorGroup()
+        colours, used = np.unique(model.vertex_colours, axis=0, return_inverse=True)
+        numbers = np.array([group.AddColor(lib3mf.Color(*colour, 255)) for colour in colours.tolist()])
+        resource, three = group.GetResourceID(), ctypes.c_uint32 * 3
+        corners = numbers[used.ravel()[model.triangles]]
+        solid.SetAllTriangleProperties([lib3mf.TriangleProperties(resource, three(*ids)) for ids in corners.tolist()])
+        solid.SetObjectLevelProperty(resource, int(numbers[0]))
+    item = content.AddBuildItem(solid, lib3mf.get_wrapper().GetIdentityTransform())
+    for number, owner in enumerate((content.SetBuildUUID, solid.SetUUID, item.SetUUID)):
+        owner(str(uuid.UUID(int=number + 1)))  # they are random otherwise
+    writer = content.QueryWriter("3mf")
+    writer.SetDecimalPrecision(9)
+    return bytes(writer.WriteToBuffer())
 
 
 def _stl(model: ObjectModel, unit: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Models as solid bodies: mass, inertia, convex parts, and MJCF (MuJoCo) and URDF for simulators."""
+"""Models as solid bodies: mass, inertia, convex parts, and MJCF (MuJoCo), URDF and SDF (Gazebo) for simulators."""
 
 from __future__ import annotations
 
@@ -202,6 +202,21 @@ class PhysicsFiles:
         """The model as URDF."""
         return self.folder / f"{self.name}.urdf"
 
+    @property
+    def usd(self) -> Path:
+        """The model as OpenUSD."""
+        return self.folder / f"{self.name}.usd"
+
+    @property
+    def sdf(self) -> Path:
+        """The model for Gazebo."""
+        return self.folder / "model.sdf"
+
+    @property
+    def config(self) -> Path:
+        """What Gazebo's list of models says of it."""
+        return self.folder / "model.config"
+
     def part(self, number: int) -> Path:
         """Return a convex part."""
         return self.folder / f"part_{number:03d}.obj"
@@ -296,6 +311,49 @@ def write_urdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
         f"{collisions}"
         "  </link>\n"
         "</robot>\n",
+    )
+
+
+def write_sdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
+    """Write the object as a model of Gazebo: SDF with its `model.config`. Meshes are found relative to it.
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    name = files.name
+    xx, yy, zz, xy, xz, yz = (f"{value:.8g}" for value in _six(body.inertia_kg_m2))
+    mesh = "<geometry><mesh><uri>{}</uri></mesh></geometry>".format
+    friction = f"<surface><friction><ode><mu>{FRICTION[0]:g}</mu><mu2>{FRICTION[0]:g}</mu2></ode></friction></surface>"
+    collisions = "".join(
+        f'      <collision name="part_{k:03d}">{mesh(files.part(k).name)}{friction}</collision>\n'
+        for k in range(len(parts.meshes))
+    )
+    write_atomically(
+        files.sdf,
+        '<?xml version="1.0"?>\n'
+        '<sdf version="1.7">\n'
+        f'  <model name="{name}">\n'
+        '    <link name="link">\n'
+        "      <inertial>\n"
+        f"        <pose>{_numbers(body.centre_m)} 0 0 0</pose>\n"
+        f"        <mass>{body.mass_kg:.8g}</mass>\n"
+        f"        <inertia><ixx>{xx}</ixx><ixy>{xy}</ixy><ixz>{xz}</ixz>"
+        f"<iyy>{yy}</iyy><iyz>{yz}</iyz><izz>{zz}</izz></inertia>\n"
+        "      </inertial>\n"
+        f'      <visual name="visual">{mesh(files.visual.name)}</visual>\n'
+        f"{collisions}"
+        "    </link>\n"
+        "  </model>\n"
+        "</sdf>\n",
+    )
+    write_atomically(
+        files.config,
+        '<?xml version="1.0"?>\n'
+        "<model>\n"
+        f"  <name>{name}</name>\n"
+        "  <version>1.0</version>\n"
+        f'  <sdf version="1.7">{files.sdf.name}</sdf>\n'
+        "</model>\n",
     )
 
 

@@ -31,6 +31,10 @@ class Checks:
             return Checks((*self.held, words), self.failed)
         return Checks(self.held, (*self.failed, otherwise or f"not {words}"))
 
+    def and_also(self, others: Checks) -> Checks:
+        """Return these checks and others."""
+        return Checks((*self.held, *others.held), (*self.failed, *others.failed))
+
     def attempt(self, what: Callable[[], tuple[bool, str]], absent: str) -> Checks:
         """Return the checks with that of a program, if installed.
 

@@ -17,13 +17,15 @@ import numpy as np
 from modeler import export as files
 from modeler import se3
 from modeler.export import bop, solids
-from modeler.export.mesh import TRIANGLES, Texture
+from modeler.export.mesh import TRIANGLES, Texture, png_bytes
 from modeler.export.placing import model_up
+from modeler.export.usd import opened_usd, write_usd
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
 from modeler.runs.checks import Checks, loaded, mesh_checks
 from modeler.runs.outputs import check_files, check_folder, run_inputs
 from modeler.runs.reopening import Reopened, reopened
 from modeler.sequences import finest_unit_mm, write_bop
+from modeler.system.extras import check_installed
 from modeler.types import Array, InputError, ObjectModel
 
 _MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}
@@ -31,7 +33,7 @@ _PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices ca
 _DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
 _LEAST_FOOTPRINT: Final = 0.02  # of the box: a smaller footprint is not a flat bottom
 
-Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "print"]
+Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print"]
 """Programs for which there are presets."""
 
 
@@ -74,6 +76,8 @@ class Preset:
             raise InputError(f"{self.out}: `purpose` {self.purpose} writes a folder; give `out` a name without suffix")
         if os.path.lexists(self.out) and not self.out.is_dir():
             raise InputError(f"{self.out}: is not a folder; choose another `out`")
+        if self.purpose == "isaac":
+            check_installed("pxr", "usd-core", "usd")
         check_files(self._outs(textured=True), inputs, overwrite=self.overwrite)
         scenes = self.out / "onboarding_static"
         if self.purpose == "bop" and scenes.exists() and (not scenes.is_dir() or any(scenes.iterdir())):
@@ -90,6 +94,10 @@ class Preset:
                 return self._mujoco()
             case "urdf":
                 return self._urdf()
+            case "isaac":
+                return self._isaac()
+            case "gazebo":
+                return self._gazebo()
             case "print":
                 return self._print()
 
@@ -101,7 +109,10 @@ class Preset:
             meshes = files.files_of(self._mesh, textured=textured and self.purpose == "foundationpose")
             return (*meshes, files.pose_file(self._mesh))
         of = solids.PhysicsFiles(self.out, textured)
-        model = (of.mjcf, of.scene) if self.purpose == "mujoco" else (of.urdf,)
+        if self.purpose == "isaac":
+            return (of.usd, of.texture, files.pose_file(of.usd))
+        of_programs = {"mujoco": (of.mjcf, of.scene), "urdf": (of.urdf,), "gazebo": (of.sdf, of.config)}
+        model = of_programs[self.purpose]
         return (*model, *files.files_of(of.visual, textured=textured), files.pose_file(of.visual), of.part(0))
 
     @property
@@ -187,28 +198,50 @@ class Preset:
         )
 
     def _mujoco(self) -> Checks:
-        of, body, parts = self._body()
-        solids.write_mjcf(of, body, parts)
+        solid = self._solid_files()
+        solids.write_mjcf(solid.of, solid.body, solid.parts)
 
         def settles() -> tuple[bool, str]:
-            settled = solids.settled_in_mujoco(of.scene)
+            settled = solids.settled_in_mujoco(solid.of.scene)
             return settled.at_rest, settled.words
 
-        return self._solid_checks(of, body, parts).attempt(settles, "MuJoCo is not installed, so not loaded there")
+        return solid.file_checks().attempt(settles, "MuJoCo is not installed, so not loaded there")
 
     def _urdf(self) -> Checks:
-        of, body, parts = self._body()
-        solids.write_urdf(of, body, parts)
+        solid = self._solid_files()
+        solids.write_urdf(solid.of, solid.body, solid.parts)
 
         def settles() -> tuple[bool, str]:
             with _quiet():  # PyBullet writes to stdout by itself
-                settled = solids.settled_in_pybullet(of.urdf, solids.drop_height_m(parts))
+                settled = solids.settled_in_pybullet(solid.of.urdf, solids.drop_height_m(solid.parts))
             return settled.at_rest, settled.words
 
-        return self._solid_checks(of, body, parts).attempt(settles, "PyBullet is not installed, so not loaded there")
+        return solid.file_checks().attempt(settles, "PyBullet is not installed, so not loaded there")
 
-    def _body(self) -> tuple[solids.PhysicsFiles, solids.Body, solids.ConvexParts]:
-        """Write the visual mesh and the convex parts, and return them with mass and inertia."""
+    def _gazebo(self) -> Checks:
+        solid = self._solid_files()
+        solids.write_sdf(solid.of, solid.body, solid.parts)
+        return solid.file_checks()
+
+    def _isaac(self) -> Checks:
+        solid = self._solid()
+        of = solid.of
+        write_usd(of, solid.model, solid.texture, solid.body, solid.parts)
+        if solid.texture is not None:
+            files.write_atomically(of.texture, png_bytes(solid.texture))
+        solid.place.write(of.usd)
+        return Checks().also(*opened_usd(of.usd)).and_also(solid.checks())
+
+    def _solid_files(self) -> _Solid:
+        """Write the visual mesh and the convex parts of the solid, and return it."""
+        solid = self._solid()
+        of = solid.of
+        files.write_mesh(solid.model, of.visual, solid.texture, axes=solid.place.axes)
+        solid.place.write(of.visual)
+        solids.write_parts(of, solid.parts)
+        return solid
+
+    def _solid(self) -> _Solid:
         whole = self._model(watertight=True)
         place = files.placement(whole, self._reopened.report, "base", "z")
         density = self.density_kg_m3 or _DENSITY_KG_M3
@@ -216,23 +249,10 @@ class Preset:
         parts = solids.convex_parts(place.placed(whole))
         model, texture = self._coloured(whole)
         of = solids.PhysicsFiles(self.out, texture is not None)
-        files.write_mesh(place.placed(model), of.visual, texture, axes=place.axes)
-        place.write(of.visual)
-        solids.write_parts(of, parts)
         self._report(place)
         source = "as given" if self.mass_kg is not None else f"at {density:g} kg/m³"
         self.say(f"{body.mass_kg:.3g} kg {source}; friction {solids.FRICTION[0]:g}, a default: neither is measured")
-        return of, body, parts
-
-    def _solid_checks(self, of: solids.PhysicsFiles, body: solids.Body, parts: solids.ConvexParts) -> Checks:
-        return (
-            mesh_checks(of.visual, most_triangles=solids.MOST_TRIANGLES)
-            .also(True, f"closed around {1e6 * body.volume_m3:.1f} cm³")
-            .also(solids.is_possible_inertia(body.inertia_kg_m2), "physically possible inertia")
-            .also(
-                all(loaded(of.part(k)).is_convex for k in range(len(parts.meshes))), parts.method, "a part not convex"
-            )
-        )
+        return _Solid(of, place, place.placed(model), texture, body, parts)
 
     @property
     def _bop_model(self) -> Path:
@@ -313,6 +333,39 @@ def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, A
     else:
         found_entries = {**entries(left), **{f"shape_{name}": values for name, values in of_shape.items()}}
     return {**found_entries, "symmetries_tolerance_mm": 1000.0 * found.tolerance_m}
+
+
+@dataclass(frozen=True, eq=False)
+class _Solid:
+    """An object for simulators."""
+
+    of: solids.PhysicsFiles
+    """Where its files lie."""
+    place: files.Placement
+    """The frame of all of it."""
+    model: ObjectModel
+    """The mesh that is shown."""
+    texture: Texture | None
+    """The image around it."""
+    body: solids.Body
+    """Mass and inertia."""
+    parts: solids.ConvexParts
+    """What collides."""
+
+    def checks(self) -> Checks:
+        """Return what is to be said of its mass and its parts."""
+        return (
+            Checks()
+            .also(True, f"closed around {1e6 * self.body.volume_m3:.1f} cm³")
+            .also(solids.is_possible_inertia(self.body.inertia_kg_m2), "physically possible inertia")
+            .also(True, self.parts.method)
+        )
+
+    def file_checks(self) -> Checks:
+        """Return the same after checks of the files of its meshes."""
+        convex = all(loaded(self.of.part(k)).is_convex for k in range(len(self.parts.meshes)))
+        meshes = mesh_checks(self.of.visual, most_triangles=solids.MOST_TRIANGLES).also(convex, "parts convex")
+        return meshes.and_also(self.checks())
 
 
 @contextlib.contextmanager
