@@ -17,6 +17,12 @@ A sequence to a model, in a run folder as `modeler build` writes it:
     result = modeler.build("sequences/bundled/box", "runs/box", prior="table")
     result.trustworthy, result.model.vertices_m, result.solution.trajectory
 
+An object found in new images with its model, and followed:
+
+    tracker = modeler.Tracker(modeler.known_object("runs/box").model)
+    found = tracker.update(modeler.Frame(0, 0.0, depth_m, camera))
+    found.outcome, found.pose.mean, found.pose.covariance, found.modes
+
 Frames and units
     Lengths are in m, angles in rad unless a name ends with `_deg`; depth is the distance along the optical axis, with 0
     or NaN where nothing was measured. Camera frames have x right, y down, z forward. `target_from_source` is the (4, 4)
@@ -47,8 +53,10 @@ if TYPE_CHECKING:
         VelocityPrior,
     )
     from modeler.registration import VisibilityRegistrar
+    from modeler.runs.known_objects import KnownObject, known_object
     from modeler.segmentation import Segmenter
     from modeler.sequences import open_sequence
+    from modeler.tracking import Tracked, Tracker
     from modeler.types import (
         Camera,
         Frame,
@@ -80,7 +88,9 @@ _MODULES = {
     ),
     "modeler.views": ("Sensor",),
     "modeler.registration": ("VisibilityRegistrar",),
+    "modeler.runs.known_objects": ("KnownObject", "known_object"),
     "modeler.segmentation": ("Segmenter",),
+    "modeler.tracking": ("Tracked", "Tracker"),
     "modeler.types": (
         "Camera",
         "Frame",
@@ -106,6 +116,7 @@ __all__ = [
     "GeneralPrior",
     "HeldPrior",
     "InputError",
+    "KnownObject",
     "Modeler",
     "ObjectModel",
     "Outcome",
@@ -120,11 +131,14 @@ __all__ = [
     "Solution",
     "Step",
     "TablePrior",
+    "Tracked",
+    "Tracker",
     "TurntablePrior",
     "VelocityPrior",
     "Verdict",
     "VisibilityRegistrar",
     "build",
+    "known_object",
     "open_sequence",
     "open_stream",
     "register",

@@ -274,6 +274,8 @@ class RayImage:
     """Standard deviation of these errors along the ray, as planes around the object show it; 0 = unknown."""
     pattern_share: float = 0.0
     """Share of the variance of these errors that is fixed-pattern noise: a pixel repeats it from frame to frame."""
+    rendered: bool = False
+    """Whether it shows a model, not a photograph: then nothing of its colours stays in place because of lights."""
 
     @property
     def index(self) -> int:

@@ -167,7 +167,10 @@ class PairColour:
         """Return ρ₀, the correlation of features at the same place of both views (method, eq. 7.2).
 
         Features that stay in place while the object turns are effects of light: highlights, shading, fixed patterns.
+        A rendered view has none, and may show the object in the pose of the other.
         """
+        if self.source.rendered or self.target.rendered:
+            return 0.0
         if band not in self._static_correlations:
             own, others = (view_features(view)[band] for view in (self.source, self.target))
             subset = _subset(own.shape[1])

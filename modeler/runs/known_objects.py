@@ -1,0 +1,115 @@
+"""Objects whose model is at hand: run folders and mesh files, as they are to be found in images."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal, final
+
+import numpy as np
+
+from modeler.export import RunFolder, read_model
+from modeler.export.bop import MODELS_INFO
+from modeler.sequences import AbstractSequence, FocalFactor, RefocusedSequence
+from modeler.system.regular_files import read_regular
+from modeler.types import InputError, ObjectModel
+
+Unit = Literal["m", "cm", "mm"]
+UNITS_M: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Metres in a unit of length."""
+_ALIKE = 1e-3  # relative difference of focal lengths of one camera: files have rounded values
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class KnownObject:
+    """An object with its model."""
+
+    model: ObjectModel
+    """In m, in the frame of its file, or of `model.ply` of its run."""
+    focal: FocalFactor | None = None
+    """What the run that made the model found out about its camera."""
+
+    def seen_by(self, sequence: AbstractSequence) -> AbstractSequence:
+        """Return a sequence with the focal length that the model was made with, if it is of the same camera.
+
+        Model and frames then err alike; otherwise the model would fit badly for no fault of its pose.
+        """
+        if self.focal is None or sequence.live:
+            return sequence
+        fx_px = sequence.frame(sequence.indices[0]).camera.fx
+        same = abs(fx_px / self.focal.stated_px - 1.0) <= _ALIKE
+        return RefocusedSequence(sequence, self.focal) if same else sequence
+
+
+def known_object(path: Path, unit: Unit | None = None) -> KnownObject:
+    """Return the object of a run folder or a mesh file.
+
+    Args:
+        path: a run folder, or a mesh (PLY, OBJ, GLB, STL).
+        unit: of lengths in the file; None: m, or mm for a model of BOP, which `models_info.json` lies beside.
+
+    Raises:
+        InputError: if there is no model, or it cannot be read.
+    """
+    if path.is_dir():
+        if unit not in (None, "m"):
+            raise InputError(f"{path}: models of runs are in m; leave `unit` out")
+        camera = RunFolder(path).result().get("camera")
+        return KnownObject(read_model(path / "model.ply"), None if camera is None else _focal(camera))
+    of_bop = path.with_name(MODELS_INFO).is_file()
+    scale_m = UNITS_M[unit or ("mm" if of_bop else "m")]
+    model = read_model(path) if path.suffix.lower() == ".ply" else _read(path)
+    sigmas_m = None if model.vertex_sigmas_m is None else scale_m * model.vertex_sigmas_m
+    return KnownObject(replace(model, vertices_m=scale_m * model.vertices_m, vertex_sigmas_m=sigmas_m))
+
+
+def _focal(camera: dict[str, Any]) -> FocalFactor | None:
+    """Return the estimate of a run's camera; None where loops did not determine it."""
+    if camera.get("told_by") != "loop" or not camera.get("fx_px"):
+        return None
+    factor = camera["focal_factor"]
+    return FocalFactor(
+        factor,
+        camera["fx_px"] / factor,
+        camera.get("depth_scale", 1.0),
+        camera.get("depth_scale_sigma", 0.0),
+        camera.get("focal_factor_sigma", 0.0),
+        "loop",
+    )
+
+
+def _colours(visual: Any) -> np.ndarray | None:
+    """Return the RGB (v, 3) of a mesh's vertices, those of its texture included; None without any."""
+    if visual is None or not visual.defined:
+        return None
+    return np.asarray((visual if visual.kind in ("vertex", "face") else visual.to_color()).vertex_colors)[:, :3]
+
+
+def _read(path: Path) -> ObjectModel:
+    """Return the mesh in a file of any format, with its colours if it has any."""
+    import trimesh
+
+    content = read_regular(path)
+    try:
+        mesh = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix[1:].lower(), process=True)
+        vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        colours = _colours(mesh.visual)
+        normals = np.asarray(mesh.vertex_normals, np.float64)
+    except Exception as error:  # trimesh's readers raise whatever their parsers raise
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: cannot be read as a mesh ({why}); convert it to PLY") from None
+    if not len(triangles) or not np.isfinite(vertices).all():
+        raise InputError(f"{path}: holds no triangles with finite corners; give a triangle mesh")
+    if colours is not None and len(colours) != len(vertices):
+        colours = None
+    return ObjectModel(
+        points_m=np.zeros((0, 3)),
+        normals=np.zeros((0, 3)),
+        colours=None,
+        vertices_m=vertices,
+        triangles=triangles,
+        vertex_normals=normals,
+        vertex_colours=None if colours is None else colours.astype(np.uint8),
+    )

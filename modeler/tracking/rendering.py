@@ -1,0 +1,194 @@
+"""A model rendered into the view that registration compares a frame with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.kernels import planes
+from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel, Plane, RayImage
+from modeler.views import Sensor
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+_MARGIN = 0.35  # of a rendered image beside the model, as a share of the model's width: poses nearby fall into it
+FINE_PX, COARSE_PX = 200.0, 64.0
+"""Width of the model in a rendered image at most: finer ones do not make poses more precise; enough for a search."""
+_FAR = 100.0  # times the object's distance: depth beside a model, where nothing is
+_MISSING_SHARE = 0.1  # of the surface of a closed model: with more, it may go on beside its outline
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ModelRenderer:
+    """Renders a model as a depth camera would see it, without noise.
+
+    Surface that no view saw says nothing, nor does what is seen through a hole. Beside the outline of a model that is
+    closed but for small parts, such as the side it stood on, space is free; beside others, nothing is known.
+    """
+
+    model: ObjectModel
+    """The model, in m."""
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether there is any surface that a view saw."""
+        return bool(self._seen.any())
+
+    @cached_property
+    def centre_m(self) -> Array:
+        """Middle (3,) of the box around the surface, in the model frame."""
+        return 0.5 * (self._seen_m.min(axis=0) + self._seen_m.max(axis=0))
+
+    @cached_property
+    def radius_m(self) -> float:
+        """Radius of the sphere about the centre that contains the surface."""
+        return float(np.linalg.norm(self._seen_m - self.centre_m, axis=1).max())
+
+    @cached_property
+    def sigma_m(self) -> float:
+        """Median standard deviation of the surface along its normal; 0 where it is not known."""
+        sigmas_m = self.model.vertex_sigmas_m
+        known = np.zeros(0) if sigmas_m is None else sigmas_m[np.isfinite(sigmas_m)]
+        return float(np.median(known)) if len(known) else 0.0
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether next to nothing of the surface is missing.
+
+        The vector areas of a closed surface sum to 0; what they sum to is the area of the plane hole that is left.
+        """
+        corners = self.model.vertices_m[self.model.triangles[self._seen]]
+        areas_m2 = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        hole_m2 = float(np.linalg.norm(areas_m2.sum(axis=0)))
+        return hole_m2 <= _MISSING_SHARE * (hole_m2 + float(np.linalg.norm(areas_m2, axis=1).sum()))
+
+    def view(
+        self,
+        camera_from_model: Array,
+        camera: Camera,
+        sensor: Sensor,
+        *,
+        most_px: float = FINE_PX,
+        index: int = -1,
+        time_s: float = 0.0,
+        plane: Plane | None = None,
+    ) -> RayImage:
+        """Return the view of the model in a pose, in camera coordinates; without surface points if none faces it.
+
+        Args:
+            camera_from_model: (4, 4).
+            camera: intrinsics of the frame that it is compared with.
+            sensor: of that frame, whose smoothing the model gets, unless it was fused from smoothed views.
+            most_px: width of the model in the image at most.
+            index: frame number of the view.
+            time_s: time of the view.
+            plane: support plane of the view.
+        """
+        camera, step = self._cropped(camera_from_model, camera, most_px)
+        depth_m, seen, unknown, found = self._cast(camera_from_model, camera)
+        colour = None
+        if self.model.vertex_colours is not None:
+            colour = np.rint(self._at_hits(self.model.vertex_colours.astype(np.float64), found)).astype(np.uint8)
+        frame = Frame(index, time_s, depth_m, camera, seen, colour, unknown)
+        smoothing = sensor.smoothing if self.model.vertex_sigmas_m is None else 0.0
+        exact = replace(
+            sensor,
+            smoothing=smoothing,
+            noise_area_px=sensor.noise_area_px / step**2,
+            pattern_share=0.0,
+            sigma_inverse_per_m=0.0,
+        )
+        view = exact.ray_image(frame, plane)
+        view = replace(view, sigma_focal=0.0, range_noise_m=self.sigma_m, rendered=True)
+        return view if self.model.vertex_sigmas_m is None else _with_variances(view, self._variances(found))
+
+    def _cropped(self, camera_from_model: Array, camera: Camera, most_px: float) -> tuple[Camera, float]:
+        """Return the part of a camera's image around the model, at most so fine as is of use, and its pixels' width."""
+        x, y, z = se3.transform(camera_from_model, self.centre_m[None])[0]
+        near_m = max(z - self.radius_m, 0.2 * self.radius_m)
+        across, down = (2.0 * self.radius_m * focal / near_m for focal in (camera.fx, camera.fy))
+        step = max(max(across, down) / most_px, 1.0)
+        z = max(z, near_m)
+        left, top = (
+            camera.fx * x / z + camera.cx - (0.5 + _MARGIN) * across,
+            camera.fy * y / z + camera.cy - (0.5 + _MARGIN) * down,
+        )
+        left, top = np.floor(left), np.floor(top)
+        width, height = (int(np.ceil((1.0 + 2.0 * _MARGIN) * size / step)) for size in (across, down))
+        cropped = Camera(
+            width, height, camera.fx / step, camera.fy / step, (camera.cx - left) / step, (camera.cy - top) / step
+        )
+        return cropped, step
+
+    def _cast(
+        self, camera_from_model: Array, camera: Camera
+    ) -> tuple[npt.NDArray[np.float32], BoolArray, BoolArray, tuple[npt.NDArray[np.int64], Array]]:
+        """Return depth (h, w) in m, where seen surface is, where nothing is known, and which triangle is met where."""
+        import open3d as o3d
+
+        w, h = camera.rays()
+        rays = np.stack([w, h, np.ones_like(w)], axis=-1)
+        model_from_camera = se3.inverse(camera_from_model)
+        turned = rays @ model_from_camera[:3, :3].T
+        origins = np.broadcast_to(model_from_camera[:3, 3], turned.shape)
+        tensor = o3d.core.Tensor.from_numpy(np.concatenate([origins, turned], axis=-1).astype(np.float32))
+        hits = self._scene.cast_rays(tensor)
+        depth_m = hits["t_hit"].numpy()
+        met = np.isfinite(depth_m)
+        triangle = np.where(met, hits["primitive_ids"].numpy(), 0).astype(np.int64)
+        second, third = np.moveaxis(hits["primitive_uvs"].numpy().astype(np.float64), -1, 0)
+        weights = np.stack([1.0 - second - third, second, third], axis=-1)
+        facing = np.sum(hits["primitive_normals"].numpy() * turned, axis=-1) < 0.0
+        seen = met & facing & self._seen[triangle]
+        unknown = met & ~seen if self.closed else ~seen
+        far_m = np.float32(_FAR * np.linalg.norm(camera_from_model[:3, 3]))
+        return np.where(met, depth_m, far_m).astype(np.float32), seen, unknown, (triangle, weights)
+
+    def _at_hits(self, values: Array, found: tuple[npt.NDArray[np.int64], Array]) -> Array:
+        """Return values of vertices (v, …), interpolated where rays meet the surface (h, w, …)."""
+        triangle, weights = found
+        corners = values[self.model.triangles[triangle]]
+        return np.einsum("hwk,hwk...->hw...", weights, corners)
+
+    def _variances(self, found: tuple[npt.NDArray[np.int64], Array]) -> Array:
+        """Return the variance (h, w) in m² of the surface along its normal."""
+        sigmas_m = self.model.vertex_sigmas_m
+        assert sigmas_m is not None
+        return self._at_hits(np.where(np.isfinite(sigmas_m), sigmas_m, 0.0), found) ** 2
+
+    @cached_property
+    def _seen(self) -> BoolArray:
+        """(t,) triangles of surface that was seen."""
+        sigmas_m = self.model.vertex_sigmas_m
+        if sigmas_m is None:
+            return np.ones(len(self.model.triangles), dtype=bool)
+        return np.asarray(np.isfinite(sigmas_m)[self.model.triangles].all(axis=1), dtype=bool)
+
+    @cached_property
+    def _seen_m(self) -> Array:
+        return self.model.vertices_m[np.unique(self.model.triangles[self._seen])]
+
+    @cached_property
+    def _scene(self) -> o3d.t.geometry.RaycastingScene:
+        import open3d as o3d
+
+        scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor.from_numpy
+        scene.add_triangles(
+            tensor(self.model.vertices_m.astype(np.float32)), tensor(self.model.triangles.astype(np.uint32))
+        )
+        return scene
+
+
+def _with_variances(view: RayImage, variances_m2: Array) -> RayImage:
+    """Return a view whose surface has these variances (h, w) in m² besides its own."""
+    cells = view.layers["cells"].copy()
+    cells[..., planes.VARIANCE] += np.where(cells[..., planes.KIND] == planes.SURFACE, variances_m2, 0.0)
+    of_points = view.layers["variance_m2"] + variances_m2[view.pixels[:, 0], view.pixels[:, 1]]
+    return replace(view, layers={**view.layers, "cells": cells, "variance_m2": of_points})

@@ -1,0 +1,154 @@
+"""Poses at which a model may be in a frame, whatever its rotation: viewpoints scored cheaply, the best refined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from modeler import se3
+from modeler.kernels.gauss_newton import Regulariser
+from modeler.registration import VisibilityLikelihood
+from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.search import Search
+from modeler.tracking.rendering import COARSE_PX, ModelRenderer
+from modeler.types import Array, Camera, RayImage
+from modeler.views import Sensor
+
+_STRIDE = 4  # every fourth point is scored at the start
+_DISTINCT_RAD = 0.2  # the extent of a basin of attraction
+_MIN_POINTS = 20  # of a view, as of the registrar
+_NEAR = 1.15  # ratio of distances from which the model looks about the same
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Viewpoints:
+    """A model seen from all around at one distance, at a coarse resolution."""
+
+    camera_from_model: Array
+    """(v, 4, 4)."""
+    views: tuple[RayImage, ...]
+    """The model there."""
+    distance_m: float
+    """Of the model's centre."""
+
+    @staticmethod
+    def around(renderer: ModelRenderer, count: int, camera: Camera, sensor: Sensor, distance_m: float) -> Viewpoints:
+        """Return viewpoints evenly spread over the sphere (a Fibonacci lattice), but for those that see no surface.
+
+        Args:
+            renderer: of the model.
+            count: number of viewpoints.
+            camera: intrinsics of the frames that they are compared with.
+            sensor: of these frames.
+            distance_m: of the model's centre.
+        """
+        height = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+        around = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
+        across = np.sqrt(1.0 - height**2)
+        directions = np.stack([across * np.cos(around), across * np.sin(around), height], axis=1)
+        poses = np.stack([_aligned(direction, np.array([0.0, 0.0, 1.0])) for direction in directions])
+        poses[:, :3, 3] = np.array([0.0, 0.0, distance_m]) - poses[:, :3, :3] @ renderer.centre_m
+        views = [renderer.view(pose, camera, sensor, most_px=COARSE_PX) for pose in poses]
+        kept = [number for number, view in enumerate(views) if len(view.points_m) >= _MIN_POINTS]
+        return Viewpoints(poses[kept], tuple(views[number] for number in kept), distance_m)
+
+    def suits(self, distance_m: float) -> bool:
+        """Return whether the model looks about the same at another distance."""
+        return 1.0 / _NEAR < self.distance_m / distance_m < _NEAR
+
+
+@final
+@dataclass(frozen=True)
+class ViewpointSearch:
+    """Searches all rotations: viewpoints all around the model, turned about the line of sight."""
+
+    viewpoints: int = 48
+    """Number of viewpoints, about 30° apart."""
+    turns: int = 16
+    """Rotations about the line of sight that are scored at each."""
+    descended: int = 3
+    """Of these, the best descend."""
+    refined: int = 24
+    """Best poses of all viewpoints that descend once more, in a finer view of the model where they ended."""
+    coarse: VisibilityLikelihood = field(default_factory=lambda: VisibilityLikelihood(points=240, colour=False))
+    """Compares the frame with viewpoints."""
+    fine: VisibilityLikelihood = field(default_factory=lambda: VisibilityLikelihood(points=300))
+    """Compares it with the view of the model where they ended."""
+    search: Search = field(default_factory=Search)
+    """Stages and steps of a descent."""
+
+    def poses(
+        self, renderer: ModelRenderer, viewpoints: Viewpoints, view: RayImage, sensor: Sensor, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return camera_from_model (k, 4, 4), the likeliest first, and their log-likelihoods (k,) in nats.
+
+        No two are within a basin of attraction.
+
+        Args:
+            renderer: of the model.
+            viewpoints: around it, at about its distance.
+            view: the frame, segmented.
+            sensor: of the frame.
+            rng: source of all randomness.
+        """
+        found = [
+            self._from_viewpoint(seen, start, view, rng)
+            for start, seen in zip(viewpoints.camera_from_model, viewpoints.views, strict=True)
+        ]
+        first, _ = _ranked(found)
+        return _ranked([self._again(renderer, pose, view, sensor, rng) for pose in first[: self.refined]])
+
+    def _from_viewpoint(
+        self, seen: RayImage, camera_from_model: Array, view: RayImage, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return camera_from_model (k, 4, 4) after descent from the best turns, and log-likelihoods (k,)."""
+        pair = self.coarse.between(view, seen, rng)
+        axis = seen.centroid_m / np.linalg.norm(seen.centroid_m)
+        angles = np.arange(self.turns) * 2.0 * np.pi / self.turns
+        starts = np.broadcast_to(np.eye(4), (self.turns, 4, 4)).copy()
+        facing = _aligned(view.centroid_m / np.linalg.norm(view.centroid_m), axis)[:3, :3]
+        starts[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * axis).as_matrix() @ facing
+        starts[:, :3, 3] = seen.centroid_m - starts[:, :3, :3] @ view.centroid_m
+        scores = pair.tempered(starts, 2.0 * self.search.blurs_m(pair)[0], stride=_STRIDE)
+        return self._descended(pair, starts[np.argsort(-scores, kind="stable")[: self.descended]], camera_from_model)
+
+    def _again(
+        self, renderer: ModelRenderer, pose: Array, view: RayImage, sensor: Sensor, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return camera_from_model (1, 4, 4) after descent in the view of the model there, and its log-likelihood."""
+        seen = renderer.view(pose, view.frame.camera, sensor)
+        if len(seen.points_m) < _MIN_POINTS:
+            return np.zeros((0, 4, 4)), np.zeros(0)
+        return self._descended(self.fine.between(view, seen, rng), np.eye(4)[None], pose)
+
+    def _descended(self, pair: PairLikelihood, poses: Array, camera_from_model: Array) -> tuple[Array, Array]:
+        """Return camera_from_model (k, 4, 4) after descent from poses of the pair, and log-likelihoods (k,)."""
+        damping = 0.0025 * pair.points / self.search.extent(pair) ** 2
+        regulariser = Regulariser(se3.rows(np.eye(4)), np.zeros((6, 6)), damping, self.search.basin)
+        for blur_m in self.search.blurs_m(pair):
+            poses = pair.descend(poses, blur_m, regulariser, steps=self.search.steps)
+        return se3.inverse(poses) @ camera_from_model, pair.tempered(poses, self.search.fine_m(pair))
+
+
+def _ranked(found: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Return poses (k, 4, 4) and scores (k,), best first, without those within a basin of a better one."""
+    if not found:
+        return np.zeros((0, 4, 4)), np.zeros(0)
+    poses, scores = (np.concatenate(some) for some in zip(*found, strict=True))
+    kept: list[int] = []
+    for number in np.argsort(-scores, kind="stable"):
+        apart = se3.rotation_angle(se3.inverse(poses[kept]) @ poses[number]) if kept else np.zeros(0)
+        if np.all(apart > _DISTINCT_RAD):
+            kept.append(int(number))
+    return poses[kept], scores[kept]
+
+
+def _aligned(one: Array, other: Array) -> Array:
+    """Return the rotation (4, 4) of least angle that takes one unit vector (3,) to another."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.align_vectors(other[None], one[None])[0].as_matrix()
+    return turn

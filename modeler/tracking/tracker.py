@@ -1,0 +1,371 @@
+"""The object in images, frame by frame: found with any rotation, followed from frame to frame, or not there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, final
+
+import numpy as np
+
+from modeler import se3
+from modeler.fusion import SymmetryFinder
+from modeler.fusion.symmetries import Symmetries
+from modeler.pipeline.pairs import Prepared, prepare
+from modeler.priors.mixtures import KernelMixture
+from modeler.registration import VisibilityRegistrar
+from modeler.registration.posterior import MIN_MODE_SHARE
+from modeler.registration.visibility.search import Search
+from modeler.segmentation import Scene, Segmenter
+from modeler.tracking.errors import free_directions, of_the_camera, of_the_model
+from modeler.tracking.rendering import ModelRenderer
+from modeler.tracking.search import Viewpoints, ViewpointSearch
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractPrior,
+    Array,
+    Frame,
+    InputError,
+    Mode,
+    ObjectModel,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Solution,
+    pooled,
+)
+from modeler.views import Sensor
+
+Presence = Literal["found", "followed", "not there", "too few points"]
+
+USABLE_RAD, USABLE_M = np.radians(3.0), 0.005
+"""Largest standard deviations, of a rotation and of the object's place, with which a pose is of use."""
+
+_SIGMA_RAD, _SIGMA = 0.12, 0.15  # of a pose found by the search: rotation, and shift in units of the object's size
+_STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames before
+_MOST_STEPS = 3.0  # over which a velocity is extrapolated
+_UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
+_UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_RIVAL_NATS = 12.0  # below the best pose, a search's pose is negligible
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """The object in one frame."""
+
+    frame: int
+    """Number of the frame."""
+    time_s: float
+    """Time of the frame."""
+    outcome: Presence
+    """`found` without knowledge of the frames before, `followed` from these, or neither."""
+    pose: PoseGaussian | None = None
+    """camera_from_model, its covariance with the errors of model and camera; None where the object is not there."""
+    modes: tuple[Mode, ...] = ()
+    """The separate modes of camera_from_model, heaviest first; empty for a single one."""
+    overlap: float = 0.0
+    """Share (0..1) of the surface that frame and model should both show, at the pose, that both do show."""
+    usable: bool = False
+    """Whether there is one mode, but for the model's symmetries, within `USABLE_RAD` and `USABLE_M` of its sd."""
+    reason: str = ""
+    """Why the object is not there, or the pose not usable."""
+    seconds: float = 0.0
+    """Wall time in s."""
+    view: RayImage | None = field(default=None, repr=False)
+    """The frame prepared for registration."""
+
+
+@final
+@dataclass(eq=False)
+class Tracker:
+    """Finds the object of a model in frames of a depth camera, and follows it.
+
+    The model is rendered where the object is expected, and the frame registered against this view of it as against
+    another frame (docs/method/tracking.md). Frames without a mask are segmented.
+    """
+
+    model: ObjectModel
+    """The model, in m."""
+    sensor: Sensor = field(default_factory=Sensor)
+    """Noise of the camera."""
+    prior: AbstractPrior | None = None
+    """Prior on the motion between two frames; None: constant velocity, checked by the images alone."""
+    independent: bool = False
+    """Whether each frame stands for itself: the object may be anywhere in it, with any rotation."""
+    depth_scale_sigma: float = 0.0
+    """Standard deviation of the logarithm of the depth scale; 0 = exact."""
+    registrar: VisibilityRegistrar = field(default_factory=VisibilityRegistrar)
+    """Registers a frame against the model."""
+    search: ViewpointSearch = field(default_factory=ViewpointSearch)
+    """Finds poses with any rotation."""
+    segmenter: Segmenter = field(default_factory=Segmenter)
+    """Finds objects in frames without masks."""
+    scene: Scene = field(default_factory=Scene)
+    """As the segmenter estimated it from a sequence, if it is known beforehand."""
+    seed: int = 0
+    """Each frame has its own random generator, seeded with this and the frame's number."""
+    newest: list[Tracked] = field(default_factory=list, init=False, repr=False)
+    """The last two frames, at most, in which the object was placed one after the other."""
+
+    def __post_init__(self) -> None:
+        """Reject a model without surface, and a seed that random generators do not take.
+
+        Raises:
+            InputError: if it is one.
+        """
+        if not self.renderer.has_surface:
+            raise InputError("the model has no surface that a view saw; build it from more views")
+        if self.seed < 0:
+            raise InputError(f"the seed {self.seed} is negative; give a whole number from 0")
+
+    @cached_property
+    def renderer(self) -> ModelRenderer:
+        """Renders the model."""
+        return ModelRenderer(self.model)
+
+    @cached_property
+    def symmetries(self) -> Symmetries:
+        """Rotations that map the model onto itself; looked for once a pose is uncertain, as that takes seconds."""
+        return _SYMMETRIES.find_in(self.model, np.array([0.0, 0.0, 1.0]))
+
+    def update(self, frame: Frame) -> Tracked:
+        """Return the object in the next frame.
+
+        Args:
+            frame: in order of time; with a mask, the object is looked for in it alone.
+
+        Raises:
+            InputError: if the prior does not apply to it, or the model is far too large or small for what is in it.
+        """
+        began_s = time.perf_counter()
+        prepared = prepare(frame, self.scene, self.segmenter, self.sensor)
+        found = self._placed(frame, prepared)
+        found = replace(found, seconds=time.perf_counter() - began_s)
+        if found.pose is None:
+            self.newest.clear()
+        else:
+            self.newest = [*self.newest[-1:], found]
+        return found
+
+    def _placed(self, frame: Frame, prepared: Prepared) -> Tracked:
+        """Return the object in a frame."""
+        view = prepared.view
+        if view is None or len(view.points_m) < self.registrar.min_points:
+            return Tracked(frame.index, frame.time_s, "too few points", reason="no segment is large enough")
+        rng = np.random.default_rng([self.seed, max(frame.index, 0)])
+        if self.newest and not self.independent:
+            followed = self._followed(view, rng)
+            if followed is not None:
+                return followed
+        return self._found(view, rng)
+
+    def _followed(self, view: RayImage, rng: np.random.Generator) -> Tracked | None:
+        """Return the object as predicted from the frames before, None if the images contradict that."""
+        last, expected = self.newest[-1], self._predicted(view)
+        assert last.pose is not None
+        assert last.view is not None
+        if self.prior is None:
+            seen = self.renderer.view(expected, view.frame.camera, self.sensor)
+            density: AbstractPoseDensity = _near(view, _STEP_SIGMA_RAD, _STEP_SIGMA)
+            registrar = _FOLLOWING
+        else:
+            expected, registrar = last.pose.mean, self.registrar
+            seen = self.renderer.view(
+                expected,
+                view.frame.camera,
+                self.sensor,
+                index=last.frame,
+                time_s=last.time_s,
+                plane=last.view.plane,
+            )
+            trajectory = {one.frame: se3.inverse(one.pose.mean) for one in self.newest if one.pose is not None}
+            density = self.prior.learned(Solution(trajectory), ()).following(last.frame).between(view, seen)
+        posterior = registrar.register(view, seen, density, rng=rng)
+        if not posterior.convincing:
+            return None
+        return self._tracked(view, "followed", [(1.0, posterior, expected)])
+
+    def _predicted(self, view: RayImage) -> Array:
+        """Return camera_from_model (4, 4) as constant velocity predicts it."""
+        poses = [one.pose.mean for one in self.newest if one.pose is not None]
+        if len(poses) < 2:
+            return poses[-1]
+        (first, last), before = self.newest, poses[0]
+        pace = (view.frame.time_s - last.time_s) / max(last.time_s - first.time_s, 1e-9)
+        if not 0.0 < pace <= _MOST_STEPS:
+            return poses[-1]
+        # Motion of the object about its own centre, so that a turn does not swing it about the camera.
+        about = se3.translation(self.renderer.centre_m)
+        step = se3.log(se3.inverse(before @ about) @ poses[-1] @ about)
+        return poses[-1] @ about @ se3.exp(pace * step) @ se3.inverse(about)
+
+    def _found(self, view: RayImage, rng: np.random.Generator) -> Tracked:
+        """Return the object with any rotation."""
+        renderer = self.renderer
+        self._check_size(view)
+        distance_m = float(np.linalg.norm(view.centroid_m)) + 0.5 * renderer.radius_m
+        poses, scores = self.search.poses(renderer, self._viewpoints(view, distance_m), view, self.sensor, rng)
+        if not len(poses):
+            return Tracked(view.index, view.frame.time_s, "not there", reason="no view of the model fits", view=view)
+        hypotheses = self._registered(view, poses[scores > scores[0] - _RIVAL_NATS][: self.registrar.max_modes], rng)
+        convincing = [one for one in hypotheses if one[1].convincing]
+        if not convincing:
+            best = hypotheses[0][1]
+            return Tracked(
+                view.index,
+                view.frame.time_s,
+                "not there",
+                overlap=best.overlap,
+                reason="the images contradict the likeliest pose" if best.usable else best.outcome.label,
+                view=view,
+            )
+        return self._tracked(view, "found", convincing)
+
+    def _check_size(self, view: RayImage) -> None:
+        """Reject a model whose lengths cannot be m, as it is far larger or smaller than what the frame shows.
+
+        Raises:
+            InputError: if it is.
+        """
+        ratio = self.renderer.radius_m / (2.0 * view.size_m)
+        if 1.0 / _UNIT < ratio < _UNIT:
+            return
+        unit = min(_UNITS_M, key=lambda name: abs(np.log(ratio * _UNITS_M[name])))
+        raise InputError(
+            f"the model is {2.0 * self.renderer.radius_m:.3g} m across, and the object in frame {view.index} about "
+            f"{4.0 * view.size_m:.2g} m; if the model's lengths are in {unit}, give `unit` {unit}"
+        )
+
+    def _registered(
+        self, view: RayImage, poses: Array, rng: np.random.Generator
+    ) -> list[tuple[float, Posterior, Array]]:
+        """Return relative weight and posterior of registrations about poses (k, 4, 4), the likeliest first, and these.
+
+        The weight is that of a Gaussian about each mean (Laplace), under the noise of the one that matches best.
+        """
+        found, pairs = [], []
+        for pose in poses:
+            seen = self.renderer.view(pose, view.frame.camera, self.sensor)
+            posterior = self.registrar.register(view, seen, _near(view, _SIGMA_RAD, _SIGMA), rng=rng)
+            found.append((posterior, pose))
+            reached = self.renderer.view(se3.inverse(posterior.pose.mean) @ pose, view.frame.camera, self.sensor)
+            pairs.append(self.registrar.likelihood.between(view, reached, rng).without_holes())
+        here, fine_m = np.eye(4), self.registrar.search.fine_m(pairs[0])
+        blur_m = max(min(pair.noises_m(here, fine_m)[0] for pair in pairs), fine_m)
+        volumes = np.diag(1.0 / np.repeat([1.0, view.size_m], 3) ** 2)
+        logs = [
+            pair.tempered(here[None], blur_m)[0]
+            - 0.5 * np.linalg.slogdet(pair.curvatures(here[None], blur_m, stride=1)[0] + volumes)[1]
+            for pair in pairs
+        ]
+        weights = np.exp(np.array(logs) - max(logs))
+        order = np.argsort(-weights, kind="stable")
+        return [(float(weights[k]), *found[k]) for k in order]
+
+    def _tracked(
+        self, view: RayImage, outcome: Presence, hypotheses: Iterable[tuple[float, Posterior, Array]]
+    ) -> Tracked:
+        """Return the result of registrations with their weights, each about a pose at which the model was rendered."""
+        modes, overlap = [], 0.0
+        for weight, posterior, rendered in hypotheses:
+            overlap = overlap or posterior.overlap
+            for mode in posterior.modes or (Mode(1.0, posterior.pose),):
+                pose = _of_model(mode.pose, rendered)
+                if not any(_same(pose, other.pose) for other in modes):
+                    modes.append(Mode(weight * mode.weight, self._widened(pose, view)))
+        total = sum(mode.weight for mode in modes)
+        modes = [Mode(mode.weight / total, mode.pose) for mode in modes if mode.weight > MIN_MODE_SHARE * total]
+        modes.sort(key=lambda mode: -mode.weight)
+        reason = self._doubt(modes)
+        if reason:  # perhaps only because of the model's symmetries
+            reason = self._doubt(modes, self.symmetries)
+            free = free_directions(self.symmetries, coloured=view.frame.colour is not None)
+            modes = [Mode(mode.weight, replace(mode.pose, covariance=mode.pose.covariance + free)) for mode in modes]
+        return Tracked(
+            view.index,
+            view.frame.time_s,
+            outcome,
+            pooled(modes),
+            tuple(modes) if len(modes) > 1 else (),
+            overlap,
+            not reason,
+            reason,
+            view=view,
+        )
+
+    def _widened(self, pose: PoseGaussian, view: RayImage) -> PoseGaussian:
+        """Return a pose with the errors of the model and of the camera."""
+        covariance = pose.covariance + of_the_camera(
+            pose.mean, self.renderer.centre_m, view.sigma_focal, self.depth_scale_sigma
+        )
+        if self.renderer.sigma_m > 0.0:
+            seen = self.renderer.view(pose.mean, view.frame.camera, self.sensor)
+            covariance += of_the_model(seen, pose.mean, self.renderer)
+        return replace(pose, covariance=covariance)
+
+    def _doubt(self, modes: list[Mode], symmetries: Symmetries | None = None) -> str:
+        """Return why modes are not of use, but for symmetries; an empty text if they are."""
+        found = symmetries or Symmetries(0.0)
+        turns, first = [np.eye(4), *found.discrete], modes[0].pose
+        for mode in modes[1:]:
+            apart = [se3.rotation_angle(se3.inverse(first.mean @ turn) @ mode.pose.mean) for turn in turns]
+            if not found.continuous and min(apart) > _SIGMA_RAD:
+                return "several poses explain the image"
+        about = se3.covariance_about(first.covariance, self.renderer.centre_m)
+        across = np.eye(3)
+        for axis in found.continuous:
+            across = across @ (np.eye(3) - np.outer(axis.direction, axis.direction))
+        sigma_rad = np.sqrt(np.linalg.eigvalsh(across.T @ about[:3, :3] @ across)[-1])
+        sigma_m = np.sqrt(np.linalg.eigvalsh(about[3:, 3:])[-1])
+        if sigma_rad > USABLE_RAD:
+            return f"its rotation is uncertain by {np.degrees(sigma_rad):.1f}°"
+        return f"its place is uncertain by {1000.0 * sigma_m:.1f} mm" if sigma_m > USABLE_M else ""
+
+    def _viewpoints(self, view: RayImage, distance_m: float) -> Viewpoints:
+        """Return the viewpoints at a distance, those of earlier frames if they suit."""
+        known = self._around
+        if not known or not known[0].suits(distance_m):
+            around = Viewpoints.around(
+                self.renderer, self.search.viewpoints, view.frame.camera, self.sensor, distance_m
+            )
+            self._around[:] = [around]
+        return self._around[0]
+
+    @cached_property
+    def _around(self) -> list[Viewpoints]:
+        return []
+
+
+_SYMMETRIES = SymmetryFinder(points=1000, icp_points=150, directions=0)
+"""About the likely axes only."""
+_FOLLOWING = VisibilityRegistrar(search=Search(min_starts=12, max_starts=12, proposals=3))
+"""Few starts: the pose is predicted."""
+
+
+def _near(view: RayImage, sigma_rad: float, sigma: float) -> KernelMixture:
+    """Return a proposal about no motion, in units of the object's size."""
+    return KernelMixture(
+        np.eye(4)[None],
+        np.ones(1),
+        centre_m=view.centroid_m,
+        sigma_rad=sigma_rad,
+        sigma_m=sigma * view.size_m,
+        evidence=False,
+    )
+
+
+def _of_model(motion: PoseGaussian, rendered: Array) -> PoseGaussian:
+    """Return camera_from_model, from the motion from the frame to the model rendered in a pose (4, 4)."""
+    back = motion.inverse()  # inv(M) Exp(η) T = inv(M) T Exp(Ad(T⁻¹) η)
+    moved = se3.adjoint(se3.inverse(rendered))
+    return PoseGaussian(back.mean @ rendered, moved @ back.covariance @ moved.T, moved @ back.by_focal)
+
+
+def _same(one: PoseGaussian, other: PoseGaussian) -> bool:
+    """Return whether two poses are within two standard deviations of each other, or of a degree."""
+    xi = se3.log(se3.inverse(one.mean) @ other.mean)
+    spread = 0.5 * (one.covariance + other.covariance)
+    return bool(xi @ np.linalg.solve(spread, xi) < 4.0 or np.linalg.norm(xi[:3]) < np.radians(1.0))

@@ -1,0 +1,197 @@
+"""Objects found in rendered frames with their model, and followed: errors, covariances, and what is not there."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy import stats
+
+from modeler import se3
+from modeler.kernels import planes
+from modeler.runs.known_objects import known_object
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.tracking import ModelRenderer, Tracked, Tracker
+from modeler.tracking.errors import of_the_camera, of_the_model
+from modeler.types import Array, Camera, InputError, ObjectModel
+from modeler.views import Sensor
+from studies.calibration.specimens import load_specimen
+from studies.calibration.study import Condition, staged
+
+CAMERA = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+
+
+def model_of(mesh: trimesh.Trimesh) -> ObjectModel:
+    normals = np.asarray(mesh.vertex_normals, np.float64)
+    empty = np.zeros((0, 3))
+    return ObjectModel(empty, empty, None, np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64),
+                       normals, None)  # fmt: skip
+
+
+@cache
+def rendered(shape: str, frames: int = 2, step_deg: float = 40.0) -> tuple[RenderedSequence, ObjectModel]:
+    """A sequence of a shape, and its true model."""
+    sequence = RenderedSequence(staged(load_specimen(shape), Condition(step_deg=step_deg), frames=frames, seed=1))
+    mesh = sequence.model()
+    return sequence, model_of(trimesh.Trimesh(mesh.vertices_m, mesh.triangles, process=True))
+
+
+def tracked(shape: str, model: ObjectModel, *, independent: bool) -> Iterator[tuple[Tracked, Array]]:
+    """What a tracker says to each frame, and the truth."""
+    sequence, _ = rendered(shape) if independent else rendered(shape, 4, 6.0)
+    tracker, truth = Tracker(model, Sensor(sequence.sensor()), independent=independent), sequence.truth()
+    for frame in sequence:
+        yield tracker.update(frame), truth[frame.index]
+
+
+@cache
+def answers(shape: str, *, independent: bool) -> list[tuple[Tracked, Array]]:
+    return list(tracked(shape, rendered(shape)[1], independent=independent))
+
+
+SHAPES = ("drill", "boot", "stapler")
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_an_object_is_found_with_any_rotation(shape: str) -> None:
+    for found, truth in answers(shape, independent=True):
+        assert found.outcome == "found"
+        assert found.pose is not None
+        assert found.usable, found.reason
+        assert np.degrees(se3.rotation_angle(se3.inverse(found.pose.mean) @ truth)) < 1.0
+        centre_m = rendered(shape)[1].vertices_m.mean(axis=0)[None]
+        assert np.linalg.norm(se3.transform(found.pose.mean, centre_m) - se3.transform(truth, centre_m)) < 0.002
+
+
+def test_an_object_is_followed_once_it_is_found() -> None:
+    outcomes = [found.outcome for found, _ in answers("boot", independent=False)]
+    assert outcomes == ["found", "followed", "followed", "followed"]
+
+
+def test_covariances_hold_the_truth_as_often_as_they_say() -> None:
+    squares = []
+    for shape in SHAPES:
+        for found, truth in [*answers(shape, independent=True), *answers(shape, independent=False)]:
+            assert found.pose is not None
+            xi = se3.log(se3.inverse(found.pose.mean) @ truth)
+            squares.append(float(xi @ np.linalg.solve(found.pose.covariance, xi)))
+    low, high = stats.chi2.ppf([0.001, 0.999], 6 * len(squares))
+    assert 0.5 * low < sum(squares) < 1.5 * high  # covariances are estimates, too
+    assert max(squares) < stats.chi2.ppf(1.0 - 1e-6, 6)
+
+
+@pytest.mark.parametrize(("shown", "sought"), [("drill", "boot"), ("boot", "drill"), ("stapler", "boot")])
+def test_another_object_is_not_there(shown: str, sought: str) -> None:
+    for found, _ in tracked(shown, rendered(sought)[1], independent=True):
+        assert found.outcome == "not there"
+        assert found.pose is None
+        assert found.reason
+        assert not found.usable
+
+
+def test_the_turn_of_a_can_about_its_axis_is_open_and_its_pose_of_use() -> None:
+    _, model = rendered("can")
+    tracker_axis = np.array([0.0, 0.0, 1.0])
+    for found, truth in answers("can", independent=True):
+        assert found.pose is not None
+        assert found.usable, found.reason
+        about = se3.covariance_about(found.pose.covariance, model.vertices_m.mean(axis=0))
+        assert np.degrees(np.sqrt(tracker_axis @ about[:3, :3] @ tracker_axis)) > 90.0
+        tilt = np.degrees(np.arccos(abs(found.pose.mean[:3, 2] @ truth[:3, 2])))
+        assert tilt < 1.5
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    once, again = answers("boot", independent=True)[0][0], next(tracked("boot", rendered("boot")[1], independent=True))
+    assert once.pose is not None
+    assert again[0].pose is not None
+    assert np.array_equal(once.pose.mean, again[0].pose.mean)
+    assert np.array_equal(once.pose.covariance, again[0].pose.covariance)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(100.0, "cm"), (1000.0, "mm"), (0.01, "m"), (0.001, "m")])
+def test_a_model_in_the_wrong_unit_is_recognised(factor: float, unit: str) -> None:
+    sequence, model = rendered("boot")
+    tracker = Tracker(replace(model, vertices_m=factor * model.vertices_m), Sensor(sequence.sensor()))
+    with pytest.raises(InputError, match=f"lengths are in {unit}, give `unit` {unit}$"):
+        tracker.update(sequence.frame(0))
+
+
+def test_a_model_without_seen_surface_is_refused() -> None:
+    model = model_of(trimesh.creation.box((0.1, 0.1, 0.1)))
+    unseen = replace(model, vertex_sigmas_m=np.full(len(model.vertices_m), np.inf))
+    with pytest.raises(InputError, match="no surface"):
+        Tracker(unseen)
+
+
+def ball_at(distance_m: float, radius_m: float = 0.05) -> tuple[ModelRenderer, Array]:
+    ball = model_of(trimesh.creation.icosphere(subdivisions=5, radius=radius_m))
+    return ModelRenderer(ball), se3.translation(np.array([0.05, -0.02, distance_m]))
+
+
+def test_a_rendered_ball_lies_where_it_is() -> None:
+    renderer, pose = ball_at(0.6)
+    view = renderer.view(pose, CAMERA, replace(Sensor(), smoothing=0.0))
+    away = view.points_m - pose[:3, 3]
+    assert len(view.points_m) > 1000
+    assert np.abs(np.linalg.norm(away, axis=1) - 0.05).max() < 5e-4
+    assert np.sum(view.normals * away, axis=1).min() > 0.048
+
+
+def test_space_beside_a_closed_model_is_free_and_beside_half_of_one_unknown() -> None:
+    renderer, pose = ball_at(0.6)
+    whole = renderer.model
+    half = whole.triangles[whole.vertices_m[whole.triangles][:, :, 2].mean(axis=1) < 0.0]
+    for model, kind in ((whole, planes.BACKGROUND), (replace(whole, triangles=half), planes.RAGGED)):
+        view = ModelRenderer(model).view(pose, CAMERA, Sensor())
+        kinds = view.layers["cells"][..., planes.KIND]
+        assert kinds[0, 0] == kind
+        assert (kinds == planes.SURFACE).any()
+
+
+def test_surface_that_no_view_saw_says_nothing() -> None:
+    renderer, pose = ball_at(0.6)
+    sigmas_m = np.where(renderer.model.vertices_m[:, 0] > 0.0, np.inf, 1e-3)
+    view = ModelRenderer(replace(renderer.model, vertex_sigmas_m=sigmas_m)).view(pose, CAMERA, Sensor())
+    assert len(view.points_m)
+    assert (view.points_m[:, 0] < pose[0, 3] + 1e-3).all()
+    assert view.layers["variance_m2"].min() >= 1e-6 * 0.999
+
+
+def test_a_models_error_moves_a_ball_but_turns_it_not() -> None:
+    renderer, pose = ball_at(0.6)
+    model = replace(renderer.model, vertex_sigmas_m=np.full(len(renderer.model.vertices_m), 1e-3))
+    renderer = ModelRenderer(model)
+    covariance = of_the_model(renderer.view(pose, CAMERA, Sensor()), pose, renderer)
+    assert np.sqrt(np.trace(covariance[:3, :3])) < np.radians(0.2)
+    assert 2e-4 < np.sqrt(np.trace(covariance[3:, 3:])) < 3e-3
+
+
+def test_a_longer_focal_length_moves_an_object_to_the_axis() -> None:
+    pose = se3.exp(np.array([0.3, -0.2, 1.0, 0.0, 0.0, 0.0]))
+    pose[:3, 3] = [0.2, 0.0, 1.0]
+    covariance = of_the_camera(pose, np.zeros(3), 0.01, 0.0)
+    in_camera = pose[:3, :3] @ covariance[3:, 3:] @ pose[:3, :3].T
+    assert np.allclose(in_camera, np.diag([0.002**2, 0.0, 0.0]), atol=1e-12)
+    along = pose[:3, :3] @ of_the_camera(pose, np.zeros(3), 0.0, 0.01)[3:, 3:] @ pose[:3, :3].T
+    assert np.sqrt(np.trace(along)) == pytest.approx(0.01 * np.hypot(0.2, 1.0))
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl"])
+def test_meshes_of_all_formats_are_read_in_their_unit(suffix: str, tmp_path: Path) -> None:
+    mesh, path = trimesh.creation.box((100.0, 60.0, 40.0)), tmp_path / f"box.{suffix}"
+    mesh.export(path)
+    assert np.allclose(np.ptp(known_object(path, "mm").model.vertices_m, axis=0), [0.1, 0.06, 0.04])
+    assert np.allclose(np.ptp(known_object(path).model.vertices_m, axis=0), [100.0, 60.0, 40.0])
+    (tmp_path / "models_info.json").write_text("{}")
+    assert np.allclose(np.ptp(known_object(path).model.vertices_m, axis=0), [0.1, 0.06, 0.04])
+
+
+@pytest.mark.parametrize("name", ["box.obj", "box.stl", "box.ply", "box.xyz"])
+def test_what_is_no_mesh_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("no mesh")
+    with pytest.raises(InputError, match=name):
+        known_object(tmp_path / name)
