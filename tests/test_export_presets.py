@@ -344,7 +344,7 @@ def _check_bop(out: Path, built: Path) -> None:
     [
         (("--for", "print", "--out", "a.stl"), "writes a folder"),
         (("--for", "print", "--out", "a", "--up", "y"), "decides on --up"),
-        (("--for", "prints", "--out", "a"), "one of bop, foundationpose"),
+        (("--for", "prints", "--out", "a"), "one of bop, colmap, foundationpose"),
         (("--for", "bop", "--out", "a", "--mass-kg", "1"), "goes with --for mujoco"),
         (("--for", "urdf", "--out", "a", "--mass-kg", "0"), "out of range"),
         (("--for", "urdf", "--out", "a", "--mass-kg", "1", "--density-kg-m3", "1"), "give one of them"),

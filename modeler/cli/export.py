@@ -14,7 +14,7 @@ from modeler.composition.options import default
 
 Origin = Literal["camera", "base", "centre", "bbox"]  # spelt out here, for help imports nothing heavy
 Up = Literal["z", "y"]
-Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print"]
+Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print", "nerfstudio", "colmap"]
 _BODIES = ("mujoco", "urdf", "isaac", "gazebo")
 
 if TYPE_CHECKING:
@@ -39,7 +39,8 @@ class Export:
     purpose: Annotated[Purpose | None, tyro.conf.arg(name="for"), default("none")] = None
     """Write a folder with all files for a program, read them back and check them: foundationpose (OBJ with texture),
     bop (models and onboarding_static), mujoco, urdf, isaac (OpenUSD) and gazebo (SDF) with mesh, convex parts, mass and
-    inertia, print (watertight STL in mm with a flat bottom)."""
+    inertia, print (watertight STL in mm with a flat bottom), nerfstudio and colmap (images with masks and
+    cameras around the object at rest, for radiance fields and splats)."""
     overwrite: bool = False
     """Replace existing files."""
     origin: Annotated[Origin | None, default("base")] = None

@@ -19,6 +19,12 @@ from modeler import se3
 from modeler.export import bop, solids
 from modeler.export.mesh import TRIANGLES, Texture, png_bytes
 from modeler.export.placing import model_up
+from modeler.export.posed_images import (
+    PosedImages,
+    share_within_masks,
+    write_colmap,
+    write_nerfstudio,
+)
 from modeler.export.usd import opened_usd, write_usd
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
 from modeler.runs.checks import Checks, loaded, mesh_checks
@@ -31,9 +37,11 @@ from modeler.types import Array, InputError, ObjectModel
 _MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}
 _PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices carry the colours
 _DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
+_SIGMAS: Final = 3.0  # of depth, up to which a point is seen where it was measured
+_WITHIN_MASKS: Final = 0.9  # share of the initial points; some lie at the rim, or behind a hand
 _LEAST_FOOTPRINT: Final = 0.02  # of the box: a smaller footprint is not a flat bottom
 
-Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print"]
+Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print", "nerfstudio", "colmap"]
 """Programs for which there are presets."""
 
 
@@ -100,6 +108,8 @@ class Preset:
                 return self._gazebo()
             case "print":
                 return self._print()
+            case "nerfstudio" | "colmap":
+                return self._posed_images()
 
     def _outs(self, *, textured: bool) -> tuple[Path, ...]:
         """Return the files to write, except convex parts and scenes, whose number is unknown before."""
@@ -108,6 +118,10 @@ class Preset:
         if self.purpose in _MESHES:
             meshes = files.files_of(self._mesh, textured=textured and self.purpose == "foundationpose")
             return (*meshes, files.pose_file(self._mesh))
+        if self.purpose == "nerfstudio":
+            return (self.out / "transforms.json", self._points, files.pose_file(self._points))
+        if self.purpose == "colmap":
+            return (*(self.out / "sparse" / "0" / f"{name}.bin" for name in ("cameras", "images", "points3D")),)
         of = solids.PhysicsFiles(self.out, textured)
         if self.purpose == "isaac":
             return (of.usd, of.texture, files.pose_file(of.usd))
@@ -253,6 +267,31 @@ class Preset:
         source = "as given" if self.mass_kg is not None else f"at {density:g} kg/m³"
         self.say(f"{body.mass_kg:.3g} kg {source}; friction {solids.FRICTION[0]:g}, a default: neither is measured")
         return _Solid(of, place, place.placed(model), texture, body, parts)
+
+    @property
+    def _points(self) -> Path:
+        """Initial points of a data set for radiance fields."""
+        return self.out / "points.ply"
+
+    def _posed_images(self) -> Checks:
+        run, out = self._reopened, self.out
+        if any(view.frame.colour is None for view in run.views.values()):
+            raise InputError(f"{self.run_folder}: its frames have no colour, which {self.purpose} is about")
+        model = self._model(watertight=False)
+        place = files.placement(model, run.report, "base", "z")
+        mesh_from_object = se3.inverse(place.object_from_mesh)
+        poses = {k: mesh_from_object @ pose for k, pose in run.solution.trajectory.items() if k in run.views}
+        data = PosedImages.of(place.placed(model), {k: run.views[k].frame for k in poses}, poses)
+        self._report(place)
+        if self.purpose == "nerfstudio":
+            write_nerfstudio(data, out)
+            place.write(self._points)
+            share = share_within_masks(out)
+            words = f"{100.0 * share:.0f} % of {len(data.points_m)} points within the masks of {len(poses)} images"
+            return Checks().also(share > _WITHIN_MASKS, words, f"only {words}")
+        tolerance_m = _SIGMAS * max(view.sigma_r_m for view in run.views.values())
+        count = write_colmap(data, out, tolerance_m)
+        return Checks().also(count > 0, f"{count} points seen in {len(poses)} images", "no image sees a point")
 
     @property
     def _bop_model(self) -> Path:
