@@ -115,8 +115,11 @@ def naive_integrate(voxels, tau_m, empty_weight, views):
         while remaining:
             best = naive_side(votes, remaining, tau_m)
             side = [k for k in remaining if votes[k][2] @ votes[best][2] > tsdf.SAME_SIDE]
-            values[number], totals[number] = tau_m * emptiness, emptiness + sum(votes[k][1] for k in side)
-            values[number] = (values[number] + sum(votes[k][1] * votes[k][0] for k in side)) / totals[number]
+            weight = sum(votes[k][1] for k in side)
+            excess = max(0.0, emptiness - weight)
+            values[number] = excess * tau_m + sum(votes[k][1] * votes[k][0] for k in side)
+            totals[number] = max(emptiness, weight)
+            values[number] /= totals[number]
             against = [k for k in remaining if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
             if len(against) < tsdf.MAJORITY * len(side):
                 break

@@ -145,6 +145,57 @@ def test_only_vertices_asked_for_are_smoothed_and_nothing_shrinks(rng: np.random
     )
 
 
+CUBE = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().subdivide().subdivide().subdivide().subdivide()
+
+
+def bumpy_cube(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return the cube's vertices off by bumps several triangles wide, and the distance of each from the cube's edges.
+
+    Bumps are along the normals, 0.2 mm high (rms).
+    """
+    bumps = np.zeros(len(CUBE.vertices))
+    for _ in range(40):
+        wave = rng.normal(0.0, 2.0 * np.pi / 0.02, 3)
+        bumps += np.cos(CUBE.vertices @ wave + rng.uniform(0.0, 2.0 * np.pi))
+    vertices_m = CUBE.vertices + 2e-4 * (bumps / bumps.std())[:, None] * CUBE.vertex_normals
+    return np.asarray(vertices_m), 0.05 - np.sort(np.abs(CUBE.vertices), axis=1)[:, 1]
+
+
+def cube_distance_m(vertices_m: Array) -> Array:
+    return np.abs(np.abs(vertices_m).max(axis=1) - 0.05)
+
+
+def test_flat_gets_flat_edges_stay_and_no_vertex_moves_beyond_its_limit(rng: np.random.Generator) -> None:
+    vertices_m, edge_m = bumpy_cube(rng)
+    limits_m = np.full(len(vertices_m), 4e-4)
+    smooth_m = meshing.without_relief(vertices_m, CUBE.faces, limits_m)
+    assert np.linalg.norm(smooth_m - vertices_m, axis=1).max() <= 4e-4 * (1.0 + 1e-12)
+    face, edge = edge_m > 0.01, edge_m < 1e-9
+    assert np.mean(cube_distance_m(smooth_m[face]) ** 2) < 0.25 * np.mean(cube_distance_m(vertices_m[face]) ** 2)
+    rounded_m = meshing.laplacian_smoothed(vertices_m, CUBE.faces, np.ones(len(vertices_m), dtype=bool), 5)
+    assert cube_distance_m(smooth_m[edge]).mean() < 1.2 * cube_distance_m(vertices_m[edge]).mean()
+    assert cube_distance_m(rounded_m[edge]).mean() > 2.0 * cube_distance_m(vertices_m[edge]).mean()
+    normals, true = (meshing.normals_of(of, CUBE.faces)[face] for of in (smooth_m, np.asarray(CUBE.vertices)))
+    assert np.median(np.arccos(np.clip(np.sum(normals * true, axis=1), -1.0, 1.0))) < np.radians(2.0)
+
+
+def test_smoothing_moves_with_the_mesh_and_leaves_what_is_sure_or_smooth(rng: np.random.Generator) -> None:
+    vertices_m, edge_m = bumpy_cube(rng)
+    limits_m = np.where(edge_m > 0.02, 2e-4, 0.0)
+    smooth_m = meshing.without_relief(vertices_m, CUBE.faces, limits_m)
+    np.testing.assert_array_equal(smooth_m[limits_m == 0.0], vertices_m[limits_m == 0.0])
+    moved = se3.exp(np.array([0.4, -0.7, 0.3, 0.1, -0.2, 0.5]))
+    np.testing.assert_allclose(
+        meshing.without_relief(se3.transform(moved, vertices_m), CUBE.faces, limits_m),
+        se3.transform(moved, smooth_m),
+        atol=1e-9,
+    )
+    exact_m = np.asarray(CUBE.vertices)
+    np.testing.assert_allclose(meshing.without_relief(exact_m, CUBE.faces, limits_m), exact_m, atol=1e-12)
+    nothing = np.zeros((0, 3), dtype=np.int64)
+    np.testing.assert_array_equal(meshing.without_relief(exact_m, nothing, limits_m), exact_m)
+
+
 def test_grown_marks_reach_as_many_rings_as_asked() -> None:
     one = np.zeros(len(ICOSPHERE.vertices), dtype=bool)
     one[0] = True
@@ -164,7 +215,9 @@ def test_crumbs_along_the_seam_and_where_views_know_little_are_smoothed(
     vertices_m[crumbs] *= 1.0 + 0.5 * EDGE_M / RADIUS_M
     seen_m = vertices_m[vertices_m[:, 2] > 0.0]
     weak = seen_m[:, 2] > weak_above_m
-    found_m, triangles, shown = watertight.cleaned(vertices_m, TRIANGLES, seen_m, weak, voxel_m=0.5 * EDGE_M, passes=0)
+    found_m, triangles, shown = watertight.cleaned(
+        vertices_m, TRIANGLES, seen_m, weak, np.zeros(len(seen_m)), voxel_m=0.5 * EDGE_M, passes=0
+    )
     np.testing.assert_array_equal(np.sort(triangles), np.sort(TRIANGLES))
     np.testing.assert_array_equal(shown, vertices_m[:, 2] > 0.0)
     equator = np.abs(vertices_m[:, 2]) < EDGE_M

@@ -238,18 +238,18 @@ class FusionVolume:
         for _ in range(self.fuser.closing):
             field = filled(field)
         vertices, triangles = meshing.extracted_mesh(field)
-        kept, weak = self._kept(vertices, triangles)
+        kept, weak, sigmas_m = self._kept(vertices, triangles)
         shown = triangles[np.all(kept[triangles], axis=1)]
         shown = shown[meshing.large_pieces(vertices, shown, self.fuser.min_piece)]
         used, compact = meshing.used_vertices(shown, len(vertices))
         if watertight:
-            return self._closed_mesh(field, vertices, used, weak)
+            return self._closed_mesh(field, vertices, used, weak, sigmas_m)
         smooth = meshing.taubin_smoothed(vertices[used], compact, self.fuser.fairing)
         smooth = meshing.taubin_smoothed(smooth, compact, meshing.WEAK_PASSES, weak[used])
-        return smooth, compact, np.ones(len(used), dtype=bool)
+        return meshing.without_relief(smooth, compact, sigmas_m[used]), compact, np.ones(len(used), dtype=bool)
 
-    def _kept(self, vertices: Array, triangles: meshing.Triangles) -> tuple[BoolArray, BoolArray]:
-        """Return which vertices (v,) of the zero level set are surface, and which (v,) have weak support.
+    def _kept(self, vertices: Array, triangles: meshing.Triangles) -> tuple[BoolArray, BoolArray, Array]:
+        """Return which vertices (v,) of the zero level set are surface, which have weak support, and their sd in m.
 
         Surface is supported, not seen empty by several views, and does not fold over at a border.
         """
@@ -263,10 +263,16 @@ class FusionVolume:
         loose = meshing.folded(vertices, normals, seen, marked & ~seen)
         marked = meshing.without_loose_border(marked, loose, triangles, FOLD_RINGS)
         usual = float(np.median(found.weight[marked])) if marked.any() else 0.0
-        return meshing.spikes_removed(marked, triangles, self.fuser.opening), found.weight < meshing.WEAK * usual
+        kept = meshing.spikes_removed(marked, triangles, self.fuser.opening)
+        return kept, found.weight < meshing.WEAK * usual, found.sigmas_m
 
     def _closed_mesh(
-        self, field: DistanceField, vertices: Array, used: npt.NDArray[np.int64], weak: BoolArray
+        self,
+        field: DistanceField,
+        vertices: Array,
+        used: npt.NDArray[np.int64],
+        weak: BoolArray,
+        sigmas_m: Array,
     ) -> tuple[Array, meshing.Triangles, BoolArray]:
         """Return the watertight mesh: vertices, triangles, and which vertices the views support."""
         unused = np.ones(len(vertices), dtype=bool)
@@ -276,6 +282,7 @@ class FusionVolume:
             *meshing.extracted_mesh(watertight.closed_field(field, self.views, self.tau_m)),
             vertices[used],
             weak[used],
+            sigmas_m[used],
             voxel_m=self.grid.voxel_m,
             passes=self.fuser.fairing,
         )

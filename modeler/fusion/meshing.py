@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from modeler.fusion.depth_views import ViewBlocks
-from modeler.kernels import marching_cubes, tsdf
+from modeler.kernels import marching_cubes, relief, tsdf
 from modeler.types import Array, BoolArray
 
 LEAST_NEIGHBOURS = 15  # of the 26 around a voxel that fill it: more than half, so that open borders do not grow
@@ -134,6 +134,7 @@ def crossed(values_m: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
 Triangles = npt.NDArray[np.int64]
 
 # Chosen by hand where nothing else is said.
+RAYLEIGH_MEDIAN = 1.1774  # of the length of two independent normal variables of variance 1
 PINCH_ROUNDS = 50  # at most; a few rounds resolve all pinches of every field tried in the tests
 COLOUR_NEIGHBOURS = 6  # vertices whose colours are interpolated where none was observed
 NORMAL_NEIGHBOURS = 12  # supported vertices whose normals are compared with an unsupported one's
@@ -141,6 +142,9 @@ FOLD_RAD = 0.7  # a surface that turns by more within a few voxels folds over
 WEAK = 0.2  # vertices with less than this share of the median support are weak
 WEAK_PASSES = 40  # of smoothing weak vertices
 PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxels
+EDGE = 4.685  # sd of the differences between neighbouring normals that make an edge: Tukey's, of 95 % efficiency
+DIFFUSION_PASSES = 200  # of normals over neighbouring triangles: some 15 triangles far
+FITTING_PASSES = 60  # of vertices to normals
 
 
 def without_pinches(field: DistanceField) -> DistanceField:
@@ -299,6 +303,41 @@ def taubin_smoothed(vertices_m: Array, triangles: Triangles, passes: int, only: 
     for step in [0.5, -0.53] * passes:  # pass band at 1 / 0.5 - 1 / 0.53 = 0.11, as Taubin proposes
         vertices_m[moving] += step * (mean @ vertices_m - vertices_m[moving])
     return vertices_m
+
+
+def without_relief(vertices_m: Array, triangles: Triangles, limits_m: Array) -> Array:
+    """Return vertices (v, 3) of a piecewise smoother surface within given distances (method, eq. 12.13).
+
+    Normals are averaged over neighbours that differ as their noise does; vertices are fitted to the averages.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3).
+        limits_m: (v,) farthest that each vertex may move: the standard deviation of its place.
+    """
+    across = _across(triangles)
+    first, side = np.nonzero(across >= 0)
+    if not len(first):
+        return vertices_m
+    normals, areas = relief.facets(vertices_m, triangles)
+    turns = np.linalg.norm(normals[first] - normals[across[first, side]], axis=1)
+    sigma = float(np.median(turns)) / RAYLEIGH_MEDIAN
+    if not sigma > 0.0:
+        return vertices_m
+    normals = relief.diffused(normals, areas, across, EDGE * sigma, DIFFUSION_PASSES)
+    return relief.fitted(vertices_m, triangles, normals, limits_m, FITTING_PASSES)
+
+
+def _across(triangles: Triangles) -> Triangles:
+    """Return the triangle across each edge (t, 3) of triangles that have at most two at an edge; -1 = none."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    keys = edges[:, 0] * (edges.max(initial=0) + 1) + edges[:, 1]
+    order = np.argsort(keys, kind="stable")
+    twice = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    first, second = order[twice], order[twice + 1]
+    across = np.full(len(edges), -1, dtype=np.int64)
+    across[first], across[second] = second // 3, first // 3
+    return across.reshape(-1, 3)
 
 
 def laplacian_smoothed(vertices_m: Array, triangles: Triangles, free: BoolArray, passes: int) -> Array:

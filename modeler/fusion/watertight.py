@@ -113,7 +113,14 @@ def _heights_m(plane: Array, views: DepthViews) -> Array:
 
 
 def cleaned(
-    vertices_m: Array, triangles: meshing.Triangles, shown_m: Array, weak: BoolArray, *, voxel_m: float, passes: int
+    vertices_m: Array,
+    triangles: meshing.Triangles,
+    shown_m: Array,
+    weak: BoolArray,
+    sigmas_m: Array,
+    *,
+    voxel_m: float,
+    passes: int,
 ) -> tuple[Array, meshing.Triangles, BoolArray]:
     """Return vertices (v, 3) and triangles (t, 3) of the largest component, smoothed, and which (v,) views saw.
 
@@ -122,6 +129,7 @@ def cleaned(
         triangles: (t, 3).
         shown_m: (n, 3) vertices that the views saw.
         weak: (n,) which of these have weak support.
+        sigmas_m: (n,) their standard deviations.
         voxel_m: side of a voxel.
         passes: of smoothing seen surface; unseen surface is smoothed more.
     """
@@ -136,7 +144,9 @@ def cleaned(
     seam = meshing.dilated(shown, triangles, 1) & meshing.dilated(~shown, triangles, 1)
     vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, seam, SEAM)
     rough = meshing.dilated(seam, triangles, SEAM) | (shown & np.append(weak, False)[nearest])
-    return meshing.taubin_smoothed(vertices_m, triangles, meshing.WEAK_PASSES, rough), triangles, shown
+    vertices_m = meshing.taubin_smoothed(vertices_m, triangles, meshing.WEAK_PASSES, rough)
+    limits_m = np.where(shown, np.append(sigmas_m, 0.0)[nearest], 0.0)
+    return meshing.without_relief(vertices_m, triangles, limits_m), triangles, shown
 
 
 def _without_deep_voids(field: DistanceField, deep: BoolArray, stride: int) -> DistanceField:

@@ -336,7 +336,7 @@ def fuse_votes(
         if best < 0:
             return tau_m, emptiness
         side = number[best]
-        total, value, agreeing = emptiness, emptiness * tau_m, 0
+        total, value, agreeing = 0.0, 0.0, 0
         for k in range(seen):
             n = number[k]
             cosine = (
@@ -346,13 +346,16 @@ def fuse_votes(
                 total += weight[k]
                 value += weight[k] * distance[k]
                 agreeing += 1
+        # eq. 12.5: what few views see through does not move surface that more see.
+        excess = max(0.0, emptiness - total)
+        result = (value + excess * tau_m) / (total + excess), total + excess
         if remaining < (1 + MAJORITY) * agreeing:
-            return value / total, total
+            return result
         against = occluding_votes(
             best, position, seen, distance, weight, number, views, index, poses, intrinsics, points, normals
         )
         if against < MAJORITY * agreeing:
-            return value / total, total
+            return result
         for k in range(seen):
             if weight[k] > 0.0 and facing(normals, side, normals, number[k]) > SAME_SIDE:
                 weight[k] = 0.0
