@@ -24,9 +24,25 @@ def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb
         first: the first accepted view, which sets the viewpoint; None before there is one.
         further: tabs after the first.
     """
-    tabs = rrb.Tabs(_poses(first), *further, _object(first), _pair(first), _edges(first), _words(), active_tab=0)
+    return _bare(rrb.Tabs(_poses(first), *further, _object(first), _pair(first), _edges(first), _words(), active_tab=0))
+
+
+def tracking_layout(first: RayImage | None) -> rrb.Blueprint:
+    """Return the layout of an object that is tracked: the frame with its outline, and the model among the points.
+
+    Args:
+        first: the first view in which it was placed, which sets the viewpoint; None before there is one.
+    """
+    words = rrb.TextDocumentView(origin=entities.TRACKED_WORDS, name="In words")
+    eye = _near(first, FROM_THE_SIDE, 4.2)
+    model = _spatial("Model in the frame's points", [f"{entities.TRACKED}/**"], eye, origin=entities.TRACKED)
+    return _bare(rrb.Horizontal(rrb.Vertical(_frame(first), words, row_shares=[3.0, 1.0]), model))
+
+
+def _bare(contents: rrb.Container) -> rrb.Blueprint:
+    """Return a blueprint of views alone, with the panel of time collapsed."""
     return rrb.Blueprint(
-        tabs,
+        contents,
         rrb.TimePanel(state="collapsed", timeline=entities.FRAME, play_state="following", fps=3.0),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

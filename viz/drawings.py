@@ -26,7 +26,7 @@ POINT_SIZE: Final = rr.Radius.ui_points(1.75)
 
 def draw_axes() -> Drawing:
     """Yield the axes of the 3D views: x right, y down, z forward."""
-    for path in (entities.PAIR, entities.WORLD):
+    for path in (entities.PAIR, entities.WORLD, entities.TRACKED):
         yield path, rr.ViewCoordinates.RDF
 
 

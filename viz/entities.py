@@ -60,6 +60,14 @@ BEFORE_POSITION_3_SIGMA: Final = "world/before/position_3_sigma"
 MERGED_BEFORE: Final = "world/merged/before_closure"
 MERGED_AFTER: Final = "world/merged/after_closure"
 
+# The object in its camera's frame.
+TRACKED: Final = "tracked"
+TRACKED_MODEL: Final = "tracked/model"
+TRACKED_MESH: Final = "tracked/model/mesh"
+TRACKED_POINTS: Final = "tracked/points"
+TRACKED_PLACE_3_SIGMA: Final = "tracked/place_3_sigma"
+TRACKED_WORDS: Final = "tracked/words"
+
 # Readings over time. Each has the series `odometry` and `closure`; the first two also `pose`.
 ROTATION_SD: Final = "readings/rotation_sd_deg"
 TRANSLATION_SD: Final = "readings/translation_sd_mm"

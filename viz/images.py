@@ -29,14 +29,18 @@ _RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and
 
 def draw_frame(step: Step) -> Drawing:
     """Yield the colour image, the depth image, and the mask of the step's frame with its outline in both."""
-    stride, coarse = stride_px(step.frame), depth_stride_px(step.frame)
-    mask = step.segmentation.mask
-    if step.frame.colour is None:
+    return draw_outlined(step.frame, step.segmentation.mask)
+
+
+def draw_outlined(frame: Frame, mask: BoolArray) -> Drawing:
+    """Yield a frame's colour and depth images, and a mask (h, w) with its outline in both."""
+    stride, coarse = stride_px(frame), depth_stride_px(frame)
+    if frame.colour is None:
         yield entities.COLOUR, CLEAR
     else:
-        yield entities.COLOUR, _jpeg(step.frame.colour[::stride, ::stride])
-    yield entities.DEPTH, _depth_png(step.frame.depth_m[::coarse, ::coarse], mask[::coarse, ::coarse])
-    stride = coarse if step.frame.colour is None else stride  # the report lays it over the colours, else over the depth
+        yield entities.COLOUR, _jpeg(frame.colour[::stride, ::stride])
+    yield entities.DEPTH, _depth_png(frame.depth_m[::coarse, ::coarse], mask[::coarse, ::coarse])
+    stride = coarse if frame.colour is None else stride  # the report lays it over the colours, else over the depth
     yield entities.MASK, rr.SegmentationImage(mask[::stride, ::stride].astype(np.uint8), draw_order=-1.0)
     for path, mask_stride in ((entities.OUTLINE, stride), (entities.DEPTH_OUTLINE, coarse)):
         lines = outline(mask[::mask_stride, ::mask_stride])

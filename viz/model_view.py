@@ -32,10 +32,10 @@ def draw_model(step: Step) -> Drawing:
         normals = model.normals[::stride]
         colours = shaded((215, 215, 215), normals) if model.colours is None else model.colours[::stride]
         yield entities.CLOUD, rr.Points3D(model.points_m[::stride], colors=colours, radii=POINT_SIZE)
-    yield entities.MESH, _mesh(model) if model is not None and meshed else CLEAR
+    yield entities.MESH, mesh(model) if model is not None and meshed else CLEAR
 
 
-def _mesh(model: ObjectModel) -> rr.Mesh3D:
+def mesh(model: ObjectModel) -> rr.Mesh3D:
     """Return the mesh, coarse enough for the recording to stay small; interpolated surface is tinted."""
     colours = np.full(model.vertices_m.shape, _PLAIN) if model.vertex_colours is None else model.vertex_colours
     colours = colours.astype(np.float64)

@@ -99,9 +99,12 @@ class RerunStream:
 
     def draw(self, step: Step | None, drawings: Iterable[tuple[str, Any]]) -> None:
         """Draw archetypes by entity at the time of a step; None: for all times."""
-        drawn, elapsed_s = tuple(drawings), time.monotonic() - self.started_s
         # A lost frame is retried after later ones: the result is logged at the latest frame.
-        frame = None if step is None else max([step.frame.index, *step.views])
+        self.draw_at(None if step is None else max([step.frame.index, *step.views]), drawings)
+
+    def draw_at(self, frame: int | None, drawings: Iterable[tuple[str, Any]]) -> None:
+        """Draw archetypes by entity at a frame; None: for all times."""
+        drawn, elapsed_s = tuple(drawings), time.monotonic() - self.started_s
 
         def log(recording: rr.RecordingStream) -> None:
             if frame is not None:

@@ -36,6 +36,7 @@ from modeler.cli.pages import Gallery, Report, View
 from modeler.cli.register import Register
 from modeler.cli.render import Render
 from modeler.cli.suggest import Suggest
+from modeler.cli.track import Track
 from modeler.system.processes import check_room, share_one_heap
 
 Command = (
@@ -51,6 +52,7 @@ Command = (
     | View
     | Report
     | Export
+    | Track
     | Join
     | Suggest
     | Gallery
@@ -69,6 +71,7 @@ COMMANDS: dict[str, type[Command]] = {
     "view": View,
     "report": Report,
     "export": Export,
+    "track": Track,
     "join": Join,
     "suggest": Suggest,
     "gallery": Gallery,

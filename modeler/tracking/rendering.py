@@ -109,6 +109,22 @@ class ModelRenderer:
         view = replace(view, sigma_focal=0.0, range_noise_m=self.sigma_m, rendered=True)
         return view if self.model.vertex_sigmas_m is None else _with_variances(view, self._variances(found))
 
+    def silhouette(self, camera_from_model: Array, camera: Camera, stride: int = 1) -> tuple[BoolArray, Array]:
+        """Return where (h, w) the model covers the image, and its depth (h, w) in m there, infinite elsewhere.
+
+        Args:
+            camera_from_model: (4, 4).
+            camera: of the image.
+            stride: of the pixels that are cast, each of which stands for a square of as many.
+        """
+        import open3d as o3d
+
+        w, h = (axis[::stride, ::stride] for axis in camera.rays())
+        hits = self._scene.cast_rays(o3d.core.Tensor.from_numpy(_rays(camera_from_model, w, h)))
+        depth_m = hits["t_hit"].numpy()
+        depth_m = np.repeat(np.repeat(depth_m, stride, axis=0), stride, axis=1)[: camera.height, : camera.width]
+        return np.isfinite(depth_m), depth_m.astype(np.float64)
+
     def _cropped(self, camera_from_model: Array, camera: Camera, most_px: float) -> tuple[Camera, float]:
         """Return the part of a camera's image around the model, at most so fine as is of use, and its pixels' width."""
         x, y, z = se3.transform(camera_from_model, self.centre_m[None])[0]
@@ -133,19 +149,14 @@ class ModelRenderer:
         """Return depth (h, w) in m, where seen surface is, where nothing is known, and which triangle is met where."""
         import open3d as o3d
 
-        w, h = camera.rays()
-        rays = np.stack([w, h, np.ones_like(w)], axis=-1)
-        model_from_camera = se3.inverse(camera_from_model)
-        turned = rays @ model_from_camera[:3, :3].T
-        origins = np.broadcast_to(model_from_camera[:3, 3], turned.shape)
-        tensor = o3d.core.Tensor.from_numpy(np.concatenate([origins, turned], axis=-1).astype(np.float32))
-        hits = self._scene.cast_rays(tensor)
+        rays = _rays(camera_from_model, *camera.rays())
+        hits = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
         depth_m = hits["t_hit"].numpy()
         met = np.isfinite(depth_m)
         triangle = np.where(met, hits["primitive_ids"].numpy(), 0).astype(np.int64)
         second, third = np.moveaxis(hits["primitive_uvs"].numpy().astype(np.float64), -1, 0)
         weights = np.stack([1.0 - second - third, second, third], axis=-1)
-        facing = np.sum(hits["primitive_normals"].numpy() * turned, axis=-1) < 0.0
+        facing = np.sum(hits["primitive_normals"].numpy() * rays[..., 3:], axis=-1) < 0.0
         seen = met & facing & self._seen[triangle]
         unknown = met & ~seen if self.closed else ~seen
         far_m = np.float32(_FAR * np.linalg.norm(camera_from_model[:3, 3]))
@@ -184,6 +195,14 @@ class ModelRenderer:
             tensor(self.model.vertices_m.astype(np.float32)), tensor(self.model.triangles.astype(np.uint32))
         )
         return scene
+
+
+def _rays(camera_from_model: Array, w: Array, h: Array) -> npt.NDArray[np.float32]:
+    """Return origins and directions (…, 6) in the model frame of rays of unit depth through w and h (…)."""
+    model_from_camera = se3.inverse(camera_from_model)
+    turned = np.stack([w, h, np.ones_like(w)], axis=-1) @ model_from_camera[:3, :3].T
+    origins = np.broadcast_to(model_from_camera[:3, 3], turned.shape)
+    return np.concatenate([origins, turned], axis=-1).astype(np.float32)
 
 
 def _with_variances(view: RayImage, variances_m2: Array) -> RayImage:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, final
@@ -69,7 +69,9 @@ class Tracked:
     overlap: float = 0.0
     """Share (0..1) of the surface that frame and model should both show, at the pose, that both do show."""
     usable: bool = False
-    """Whether there is one mode, but for the model's symmetries, within `USABLE_RAD` and `USABLE_M` of its sd."""
+    """Whether there is one mode, but for the model's symmetries, with an sd of at most `USABLE_RAD` and `USABLE_M`.
+
+    Both are given the camera, whose focal length and depth scale move all poses alike."""
     reason: str = ""
     """Why the object is not there, or the pose not usable."""
     seconds: float = 0.0
@@ -210,10 +212,11 @@ class Tracker:
         poses, scores = self.search.poses(renderer, self._viewpoints(view, distance_m), view, self.sensor, rng)
         if not len(poses):
             return Tracked(view.index, view.frame.time_s, "not there", reason="no view of the model fits", view=view)
-        hypotheses = self._registered(view, poses[scores > scores[0] - _RIVAL_NATS][: self.registrar.max_modes], rng)
-        convincing = [one for one in hypotheses if one[1].convincing]
+        likely = poses[scores > scores[0] - _RIVAL_NATS][: self.registrar.max_modes]
+        registered = [(self._registered(view, pose, rng), pose) for pose in likely]
+        convincing = [(posterior, pose) for posterior, pose in registered if posterior.convincing]
         if not convincing:
-            best = hypotheses[0][1]
+            best = registered[0][0]
             return Tracked(
                 view.index,
                 view.frame.time_s,
@@ -222,7 +225,9 @@ class Tracker:
                 reason="the images contradict the likeliest pose" if best.usable else best.outcome.label,
                 view=view,
             )
-        return self._tracked(view, "found", convincing)
+        weights = self._weights(view, convincing, rng)
+        order = np.argsort(-weights, kind="stable")
+        return self._tracked(view, "found", [(float(weights[k]), *convincing[k]) for k in order])
 
     def _check_size(self, view: RayImage) -> None:
         """Reject a model whose lengths cannot be m, as it is far larger or smaller than what the frame shows.
@@ -239,31 +244,33 @@ class Tracker:
             f"{4.0 * view.size_m:.2g} m; if the model's lengths are in {unit}, give `unit` {unit}"
         )
 
-    def _registered(
-        self, view: RayImage, poses: Array, rng: np.random.Generator
-    ) -> list[tuple[float, Posterior, Array]]:
-        """Return relative weight and posterior of registrations about poses (k, 4, 4), the likeliest first, and these.
+    def _registered(self, view: RayImage, pose: Array, rng: np.random.Generator) -> Posterior:
+        """Return the registration of a frame against the model about a pose (4, 4)."""
+        seen = self.renderer.view(pose, view.frame.camera, self.sensor)
+        return self.registrar.register(view, seen, _near(view, _SIGMA_RAD, _SIGMA), rng=rng)
 
-        The weight is that of a Gaussian about each mean (Laplace), under the noise of the one that matches best.
+    def _weights(
+        self, view: RayImage, registered: Sequence[tuple[Posterior, Array]], rng: np.random.Generator
+    ) -> Array:
+        """Return relative weights (k,) of registrations, each about a pose (4, 4) at which the model was rendered.
+
+        They are those of Gaussians about the means (Laplace), under the noise of the one that matches best.
         """
-        found, pairs = [], []
-        for pose in poses:
-            seen = self.renderer.view(pose, view.frame.camera, self.sensor)
-            posterior = self.registrar.register(view, seen, _near(view, _SIGMA_RAD, _SIGMA), rng=rng)
-            found.append((posterior, pose))
+        if len(registered) == 1:
+            return np.ones(1)
+        pairs = []
+        for posterior, pose in registered:
             reached = self.renderer.view(se3.inverse(posterior.pose.mean) @ pose, view.frame.camera, self.sensor)
             pairs.append(self.registrar.likelihood.between(view, reached, rng).without_holes())
         here, fine_m = np.eye(4), self.registrar.search.fine_m(pairs[0])
         blur_m = max(min(pair.noises_m(here, fine_m)[0] for pair in pairs), fine_m)
-        volumes = np.diag(1.0 / np.repeat([1.0, view.size_m], 3) ** 2)
+        widest = np.diag(1.0 / np.repeat([1.0, view.size_m], 3) ** 2)
         logs = [
             pair.tempered(here[None], blur_m)[0]
-            - 0.5 * np.linalg.slogdet(pair.curvatures(here[None], blur_m, stride=1)[0] + volumes)[1]
+            - 0.5 * np.linalg.slogdet(pair.curvatures(here[None], blur_m, stride=1)[0] + widest)[1]
             for pair in pairs
         ]
-        weights = np.exp(np.array(logs) - max(logs))
-        order = np.argsort(-weights, kind="stable")
-        return [(float(weights[k]), *found[k]) for k in order]
+        return np.exp(np.array(logs) - max(logs))
 
     def _tracked(
         self, view: RayImage, outcome: Presence, hypotheses: Iterable[tuple[float, Posterior, Array]]
@@ -279,11 +286,11 @@ class Tracker:
         total = sum(mode.weight for mode in modes)
         modes = [Mode(mode.weight / total, mode.pose) for mode in modes if mode.weight > MIN_MODE_SHARE * total]
         modes.sort(key=lambda mode: -mode.weight)
-        reason = self._doubt(modes)
+        reason, free = self._doubt(modes), np.zeros((6, 6))
         if reason:  # perhaps only because of the model's symmetries
             reason = self._doubt(modes, self.symmetries)
             free = free_directions(self.symmetries, coloured=view.frame.colour is not None)
-            modes = [Mode(mode.weight, replace(mode.pose, covariance=mode.pose.covariance + free)) for mode in modes]
+        modes = [Mode(mode.weight, self._of_camera(mode.pose, view, free)) for mode in modes]
         return Tracked(
             view.index,
             view.frame.time_s,
@@ -297,14 +304,16 @@ class Tracker:
         )
 
     def _widened(self, pose: PoseGaussian, view: RayImage) -> PoseGaussian:
-        """Return a pose with the errors of the model and of the camera."""
-        covariance = pose.covariance + of_the_camera(
-            pose.mean, self.renderer.centre_m, view.sigma_focal, self.depth_scale_sigma
-        )
-        if self.renderer.sigma_m > 0.0:
-            seen = self.renderer.view(pose.mean, view.frame.camera, self.sensor)
-            covariance += of_the_model(seen, pose.mean, self.renderer)
-        return replace(pose, covariance=covariance)
+        """Return a pose with the errors of the model."""
+        if self.renderer.sigma_m == 0.0:
+            return pose
+        seen = self.renderer.view(pose.mean, view.frame.camera, self.sensor)
+        return replace(pose, covariance=pose.covariance + of_the_model(seen, pose.mean, self.renderer))
+
+    def _of_camera(self, pose: PoseGaussian, view: RayImage, free: Array) -> PoseGaussian:
+        """Return a pose with the errors of the camera, and a covariance (6, 6) of what nothing shows."""
+        common = of_the_camera(pose.mean, self.renderer.centre_m, view.sigma_focal, self.depth_scale_sigma)
+        return replace(pose, covariance=pose.covariance + common + free)
 
     def _doubt(self, modes: list[Mode], symmetries: Symmetries | None = None) -> str:
         """Return why modes are not of use, but for symmetries; an empty text if they are."""

@@ -1,0 +1,113 @@
+"""`modeler track`: what it writes, says and refuses."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from command_runner import Run
+from rerun_recordings import drawn, read
+
+from modeler import se3
+from modeler.sequences import bundled, open_sequence
+from modeler.viz import entities
+
+BOX = bundled("box")
+FEW = ("--frames", "0:3", "--no-colour")
+
+
+@pytest.fixture(scope="module")
+def track(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the bundled box was tracked with its true mesh."""
+    from modeler.cli import main
+
+    out = tmp_path_factory.mktemp("track") / "out"
+    assert main(["track", str(BOX / "model.ply"), str(BOX), "--out", str(out), *FEW]) == 0
+    return out
+
+
+def test_poses_are_those_of_the_truth_but_for_symmetries(track: Path) -> None:
+    report, truth = json.loads((track / "poses.json").read_text()), open_sequence(BOX).truth()
+    assert truth is not None
+    assert report["schema"] == 1
+    assert [pose["id"] for pose in report["poses"]] == [0, 1, 2]
+    for pose in report["poses"]:
+        found = np.array(pose["camera_from_model"]).reshape(4, 4)
+        assert pose["outcome"] in ("found", "followed")
+        assert pose["usable"]
+        assert np.linalg.norm(found[:3, 3] - truth[pose["id"]][:3, 3]) < 0.003
+        off_deg = [np.degrees(se3.rotation_angle(se3.inverse(found @ turn) @ truth[pose["id"]])) for turn in TURNS]
+        assert min(off_deg) < 1.5
+        covariance = np.array(pose["covariance"]).reshape(6, 6)
+        assert np.allclose(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+
+
+TURNS = [np.diag([*signs, np.prod(signs), 1.0]) for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))]
+"""Half turns of a box about its axes."""
+
+
+def test_trajectory_and_results_of_bop_hold_the_same_poses(track: Path) -> None:
+    poses = json.loads((track / "poses.json").read_text())["poses"]
+    lines = [list(map(float, line.split())) for line in (track / "trajectory.txt").read_text().splitlines()]
+    with (track / "bop.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
+    for pose, line, row in zip(poses, lines, rows, strict=True):
+        matrix = np.array(pose["camera_from_model"]).reshape(4, 4)
+        assert line[0] == pose["timestamp"]
+        assert np.allclose(line[1:4], matrix[:3, 3])
+        assert int(row["im_id"]) == pose["id"]
+        assert np.allclose([float(number) for number in row["R"].split()], matrix[:3, :3].ravel())
+        assert np.allclose([float(number) for number in row["t"].split()], 1000.0 * matrix[:3, 3])
+
+
+def test_the_recording_has_the_model_in_its_pose(track: Path) -> None:
+    recording = read(track / "recording.rrd")
+    pose = json.loads((track / "poses.json").read_text())["poses"][1]
+    shown = drawn(recording, entities.TRACKED_MODEL, "Transform3D:translation")
+    shown = shown or drawn(recording, entities.TRACKED_MODEL, "translation")
+    assert np.allclose(np.ravel(shown[1]), np.array(pose["camera_from_model"]).reshape(4, 4)[:3, 3], atol=1e-6)
+    assert entities.TRACKED_MESH in recording
+    assert entities.TRACKED_PLACE_3_SIGMA in recording
+
+
+def test_another_object_is_not_there_which_is_an_answer(cli: Run, tmp_path: Path) -> None:
+    trimesh.creation.icosphere(subdivisions=3, radius=0.09).export(tmp_path / "ball.ply")
+    ended = cli("track", tmp_path / "ball.ply", BOX, "--out", tmp_path / "out", "--frames", "0:1", "--no-colour")
+    assert ended.status == 0
+    assert "not there in 1" in ended.err
+    [pose] = json.loads((tmp_path / "out" / "poses.json").read_text())["poses"]
+    assert (pose["outcome"], pose["camera_from_model"], pose["usable"]) == ("not there", None, False)
+    assert pose["reason"]
+
+
+def test_a_folder_with_other_things_is_left_alone(cli: Run, track: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    for out, words in ((tmp_path, "not the folder of a track"), (track, "--overwrite")):
+        ended = cli("track", BOX / "model.ply", BOX, "--out", out, *FEW)
+        assert (ended.status, ended.out) == (2, "")
+        assert words in ended.err
+        assert str(out) in ended.err
+
+
+def test_bad_models_are_refused_in_one_line(cli: Run, tmp_path: Path) -> None:
+    shutil.copy(BOX / "model.ply", tmp_path / "mm.ply")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.ply").write_text("ply")
+    mesh = trimesh.load_mesh(tmp_path / "mm.ply")
+    mesh.apply_scale(1000.0)
+    mesh.export(tmp_path / "mm.ply")
+    for name, words in (
+        ("mm.ply", "give --unit mm"),
+        ("empty", "report"),
+        ("bad.ply", "bad.ply"),
+        ("no.obj", "no.obj"),
+    ):
+        ended = cli("track", tmp_path / name, BOX, "--out", tmp_path / "out", "--overwrite", *FEW)
+        assert (ended.status, ended.out) == (2, ""), name
+        assert words in ended.err
+        assert len(ended.err.strip().splitlines()) == 1
