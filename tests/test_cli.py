@@ -352,7 +352,6 @@ def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
     lost = {"frames": [{"cause": ""}, {"cause": Outcome.NO_OVERLAP.label}], "reason_codes": ["left_out"]}
     known, unknown = (priors.TurntablePrior(-25.0, 3.0, step_sign=sign) for sign in ("known", "unknown"))
     assert sign_in_doubt(lost, known)
-    assert sign_in_doubt({"frames": [], "reason_codes": ["little_overlap"]}, known)
     assert not sign_in_doubt(lost, unknown)
     assert not sign_in_doubt(lost, priors.TablePrior())
     assert not sign_in_doubt({"frames": [], "reason_codes": ["interrupted"]}, known)

@@ -24,7 +24,9 @@ from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, P
 from modeler.views.range_noise import range_noise
 from modeler.views.sparsity import closed, gap_px, interpolated, measured_share
 
-_NOISIEST = 3.0  # largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves
+_NOISIEST = 4.2
+"""Largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves: between 3.0 of a
+first Kinect at 2 to 3 m and 5.7 of a camera moved by hand, 27 of one in large steps."""
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 
@@ -49,7 +51,7 @@ class Segmenter:
     gap: float = 0.016
     """Largest gap between parts of one object, as a share of its distance: a dozen pixels of usual cameras."""
     noise: DepthNoise = field(default_factory=DepthNoise)
-    """Expected noise of the depth camera; up to three times as much is distinguished from camera motion."""
+    """Expected noise of the depth camera; up to four times as much is distinguished from camera motion."""
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -135,7 +137,6 @@ class Segmenter:
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * AREA_FACTOR
-        sure &= not is_cut(mask, scene)
         return Segmentation(mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
 
     def _looks(self, frames: Sequence[Frame], scene: Scene) -> tuple[list[_Look], list[_Look]]:

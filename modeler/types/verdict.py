@@ -56,7 +56,7 @@ class Shortcoming:
     code: str
     """For programs: `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
     `prior_contradicted`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`, `never_came_back`,
-    `not_tried`, `free_space_violations`, `false_surface`, `little_overlap`, `other_modes`, `unsure_rotation`,
+    `not_tried`, `free_space_violations`, `false_surface`, `other_modes`, `unsure_rotation`,
     `unsure_place`, `unsure_focal` or `unsure_size`."""
     words: str
     """For people."""

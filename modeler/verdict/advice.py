@@ -66,8 +66,7 @@ def sign_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
         report: of the run.
         prior: of the run.
     """
-    little = "little_overlap" in (report.get("reason_codes") or ())
-    little = little or any(frame.get("cause") == Outcome.NO_OVERLAP.label for frame in report["frames"])
+    little = any(frame.get("cause") == Outcome.NO_OVERLAP.label for frame in report["frames"])
     table = turntable_in(prior)
     return little and table is not None and table.step_sign == "known"
 
@@ -190,8 +189,7 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
         **dict.fromkeys(("loop_open", "edges_disagree"), _camera),
         "closures_refused": _camera,
         **dict.fromkeys(("free_space_violations", "false_surface"), _surface),
-        **dict.fromkeys(("little_overlap", "other_modes"), _more_known),
-        **dict.fromkeys(("unsure_rotation", "unsure_place"), _more_known),
+        **dict.fromkeys(("other_modes", "unsure_rotation", "unsure_place"), _more_known),
         "unsure_focal": _full_turn,
         "unsure_size": _known_camera,
     }

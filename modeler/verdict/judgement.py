@@ -54,7 +54,6 @@ from modeler.verdict.spreads import (
 )
 
 _NO_SURFACE: Final = "poses are wrong, masks include more than the object, or it changed its shape"
-_LITTLE_OVERLAP: Final = 0.5  # with less overlap, registrations are sometimes wrong with a small covariance
 
 
 def judged(
@@ -90,7 +89,6 @@ def judged(
     found = _found(step, frames, edges, prior, tolerance_m) if step.last else []
     reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
-    reasons += _little_overlap(edges)
     reasons += _unconfirmed_join(edges)
     spreads = []
     if step.last:
@@ -324,16 +322,3 @@ def _came_back(solution: Solution) -> tuple[int, int] | None:
     after_deg = angles_deg[away[0] :]
     nearest = int(np.argmin(after_deg))
     return (frames[away[0] + nearest], first) if after_deg[nearest] <= NEAR_DEG else None
-
-
-def _little_overlap(edges: Sequence[Edge]) -> list[Shortcoming]:
-    """Return the reasons for pairs of views that share little surface and are joined by no other edge."""
-    return [
-        Shortcoming(
-            "little_overlap",
-            f"frames {edge.source} and {edge.target} share little surface (overlap {edge.posterior.overlap:.2f}), and "
-            "no other edge confirms their registration",
-        )
-        for edge in edges
-        if edge.posterior.overlap < _LITTLE_OVERLAP and not joined_without(edge, edges)
-    ]
