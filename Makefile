@@ -1,6 +1,6 @@
-# make setup      prepare .venv (quick if it exists)
-# make demo       model the bundled box sequence into runs/demo
-# make test       the whole gate: format, lint, types, layers, tests
+# make demo       model the bundled box sequence into runs/demo: a minute the first time, of which setup 50 s, then 10 s
+# make setup      prepare .venv for all commands (one to two minutes more, quick if that is done)
+# make test       the whole gate: format, lint, types, layers, tests (five minutes on two cores; installs the extra dev)
 # make test-slow  the slow tests, which make test leaves out
 # make docs       the guide as a site: build/site/index.html (installs the extra docs; warnings are errors)
 # make results    the tables of docs/ and the figures of README.md, from the files of studies/results
@@ -18,36 +18,36 @@ TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
 
 .PHONY: setup demo test test-slow docs results calibrate trust ablation bench bench-gpu scale same audit
 
-setup: .venv/.installed
+setup: .venv/.all
 
-.venv/.installed: pyproject.toml constraints.txt .ci/setup
-	PYTHON="$(PYTHON)" .ci/setup
+.venv/.demo .venv/.all .venv/.dev: pyproject.toml constraints.txt .ci/setup
+	PYTHON="$(PYTHON)" .ci/setup $(subst .venv/.,,$@)
 
-demo: setup
+demo: .venv/.demo
 	$(BIN)/modeler build sequences/bundled/box --prior table --out runs/demo --overwrite
 	@echo
-	@echo "The mesh is runs/demo/model.ply (any mesh viewer opens it); in another format:"
-	@echo "    $(BIN)/modeler export runs/demo --out runs/box.glb"
-	@echo "The recording is runs/demo/recording.rrd; look at the run with:"
-	@echo "    $(BIN)/modeler report runs/demo        (one page: runs/demo/report.html)"
+	@echo "The mesh is runs/demo/model.ply (any mesh viewer opens it). The recording is runs/demo/recording.rrd; look at it with:"
 	@echo "    $(BIN)/modeler view runs/demo          (in a window)"
 	@echo "    $(BIN)/modeler view runs/demo --web    (in the browser)"
+	@test -e .venv/.all || echo "    make setup                             (installs what the other commands need)"
+	@echo "    $(BIN)/modeler report runs/demo        (one page: runs/demo/report.html)"
+	@echo "    $(BIN)/modeler export runs/demo --out runs/box.glb"
 
-test: setup
+test: .venv/.dev
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/basedpyright
 	$(BIN)/lint-imports
 	$(BIN)/pytest $(TWO)
 
-test-slow: setup
+test-slow: .venv/.dev
 	$(BIN)/pytest -m slow $(TWO)
 
 docs: .venv/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "The guide is build/site/index.html; its search works where it is served: $(BIN)/mkdocs serve"
 
-.venv/.docs: .venv/.installed
+.venv/.docs: .venv/.all
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	touch $@
 
@@ -67,7 +67,7 @@ ablation: setup
 bench: setup
 	$(BIN)/python -m studies bench
 
-bench-gpu: setup
+bench-gpu: .venv/.dev
 	$(BIN)/python -m studies bench.gpu
 
 scale: setup

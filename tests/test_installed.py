@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
 import venv
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -38,6 +40,48 @@ for module in pkgutil.walk_packages(modeler.__path__, "modeler."):
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (0, "")
+
+
+WITHOUT = """
+import sys
+class Refusing:
+    def find_spec(name, path=None, target=None):
+        if name.partition(".")[0] in sys.argv[1].split(","):
+            raise ModuleNotFoundError(name=name)
+sys.meta_path.insert(0, Refusing)
+from modeler.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+def with_requirements(names: set[str]) -> set[str]:
+    """Return distributions with all that they require."""
+    required = {
+        re.split(r"[^\w.-]", requirement)[0].lower().replace("_", "-")
+        for name in names
+        for requirement in metadata.requires(name) or ()
+        if "extra ==" not in requirement and "python_version <" not in requirement
+    }
+    return names if required <= names else with_requirements(names | required)
+
+
+def test_the_demonstration_runs_on_what_is_installed_for_it(tmp_path: Path) -> None:
+    listed = re.search(r'^modelling="(.*?)"', (ROOT / ".ci" / "setup").read_text(), re.MULTILINE)
+    assert listed is not None
+    needed = with_requirements({*listed[1].split()})
+    modules = metadata.packages_distributions()
+    refused = [
+        module for module, (owner, *_) in modules.items() if owner.lower().replace("_", "-") not in {*needed, "modeler"}
+    ]
+    assert {"open3d", "matplotlib", "trimesh", "hypothesis"} <= {*refused}
+    box = ROOT / "sequences" / "bundled" / "box"
+    build = ["build", str(box), "--prior", "table", "--frames", "0:3", "--out", str(tmp_path / "run")]
+    command = [sys.executable, "-c", WITHOUT, ",".join(refused)]
+    built = subprocess.run([*command, *build], capture_output=True, text=True, check=False)
+    assert built.returncode in (0, 3), built.stderr
+    shown = subprocess.run([*command, "report", str(tmp_path / "run")], capture_output=True, text=True, check=False)
+    assert (shown.returncode, shown.stderr.count("\n")) == (2, 1)
+    assert re.search(r"the package \w+ is not installed, which this command needs; run make setup", shown.stderr)
 
 
 @pytest.mark.slow

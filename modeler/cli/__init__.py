@@ -123,6 +123,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if _exhausted(error):
             say("memory or threads are exhausted; raise the limits (ulimit -v, -u), or end other programs")
             return 2
+        if isinstance(error, ModuleNotFoundError) and not (error.name or "modeler").startswith("modeler"):
+            say(f"the package {error.name} is not installed, which this command needs; run make setup")
+            return 2
         if not isinstance(error, OSError) or error.errno is None:
             raise
         if error.filename is not None:
