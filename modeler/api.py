@@ -175,7 +175,7 @@ def build(
     settings = {"prior_args": options.prior_args, "roi": modeler.segmenter.roi}
     settings |= {"max_depth_m": modeler.segmenter.max_depth_m}
     meta = RunMeta(
-        sequence=str(inputs[0]) if inputs else frames.name,
+        sequence=_named(inputs, folder) or frames.name,
         seed=seed,
         prior=compose.resolved_prior(options, frames)[0],
         settings={name: value for name, value in settings.items() if value not in (None, ())},
@@ -205,6 +205,13 @@ def _opened(sequence: str | Path | Iterable[Frame], *, live: bool) -> AbstractSe
     if isinstance(sequence, str | Path):
         return KeptSequence(open_sequence(Path(sequence)))
     return sequence if isinstance(sequence, AbstractSequence) else GivenSequence.of(sequence, live=live)
+
+
+def _named(inputs: tuple[Path, ...], folder: Path | None) -> str:
+    """Return the name of what is read; nothing for frames in memory."""
+    if not inputs:
+        return ""
+    return str(inputs[0]) if folder is None else RunFolder(folder).stored(inputs[0])
 
 
 @contextmanager

@@ -115,7 +115,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, di
 def test_frames_of_both_runs_find_their_places(runs: tuple[Path, Path, Path, dict[int, Array]]) -> None:
     report = RunFolder(runs[2]).report()
     assert [frame["id"] for frame in report["frames"]] == list(range(2 * COUNT))
-    assert report["settings"]["joined"] == [str(run) for run in runs[:2]]
+    assert report["settings"]["joined"] == [f"../{run.name}" for run in runs[:2]]
     poses = {pose["id"]: np.reshape(pose["object_from_camera"], (4, 4)) for pose in report["poses"]}
     base = poses[0] @ se3.inverse(runs[3][0])
     for k, pose in poses.items():

@@ -24,8 +24,9 @@ def record_of(run: Path) -> dict[str, Any]:
     Raises:
         InputError: if the folder holds no run.
     """
-    report = RunFolder(run).result()
-    record = report_columns(report)
+    folder = RunFolder(run)
+    report = folder.result()
+    record = report_columns(report) | {"sequence": str(folder.located(report["sequence"]))}
     record["settings"] = json.dumps(report["settings"])
     record["versions"] = json.dumps(report.get("versions") or {})
     with contextlib.suppress(InputError):  # a run without surface, or whose sequence has moved

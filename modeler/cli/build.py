@@ -87,7 +87,7 @@ class Build:
         modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.model.voxel_m), tolerance_m=tolerance_m)
         prior, remark = compose.resolved_prior(self.prior, whole)
         meta = RunMeta(
-            sequence=str(self.sequence),
+            sequence=RunFolder(self.out).stored(self.sequence),
             seed=self.method.seed,
             prior=prior,
             settings=self.settings(),
@@ -116,10 +116,13 @@ class Build:
 
     def settings(self) -> dict[str, object]:
         """Return the settings besides sequence, seed and the prior's name, as recorded in report.json."""
+        from modeler.export import RunFolder
+
         parts = asdict(self.prior) | asdict(self.method) | asdict(self.selection) | asdict(self.where)
         parts |= {name: getattr(self.model, name) for name in ("voxel_m", "tolerance_mm")}
         files = {"sensor": self.model.sensor, "camera": self.model.camera}
-        parts |= {name: None if path is None else str(path.absolute()) for name, path in files.items()}
+        folder = RunFolder(self.out)
+        parts |= {name: None if path is None else folder.stored(path) for name, path in files.items()}
         parts |= self.given.settings()
         return {
             name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())

@@ -66,9 +66,10 @@ class Report:
         RunFolder(self.run_folder).result()  # refuses folders without a finished run
         try:
             truth = _truth(self.run_folder, self.moved.sequence)
-        except InputError:
+        except InputError as error:
             if self.moved.sequence:
                 raise
+            say(f"errors against the truth are left out: {error}")
             truth = None
         write_page(self.run_folder, out, truth)
         say(f"open {out} in a browser")

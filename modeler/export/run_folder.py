@@ -22,6 +22,8 @@ from modeler.types import InputError, Step
 _REPORT = "report.json"
 _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
 """The report, without which nothing is resumed, goes first."""
+_PATHS = ("sequence", "sensor", "camera")
+"""Entries of a report and of its settings that are paths."""
 PAGE = "report.html"
 """Page of `modeler report`; removed together with the run."""
 
@@ -126,6 +128,19 @@ class RunFolder:
         """The registrations of a run that has not ended."""
         return Pairs(self.path / ".pairs")
 
+    def stored(self, path: Path) -> str:
+        """Return a path as the report has it: relative to the folder, so that both can be moved together.
+
+        What is no file or folder, such as a device, stays as it is.
+        """
+        place = Path(os.path.realpath(path.parent), path.name) if path.name not in ("", "..") else path.resolve()
+        return os.path.relpath(place, os.path.realpath(self.path)) if path.exists() else str(path)
+
+    def located(self, stored: str) -> Path:
+        """Return the path that a report means; those of earlier versions are relative to the current folder."""
+        path = Path(os.path.normpath(os.path.join(os.path.realpath(self.path), stored)))
+        return path if path.exists() or not Path(stored).exists() else Path(stored)
+
     def report(self) -> dict[str, Any]:
         """Return the report in the folder.
 
@@ -168,6 +183,8 @@ class RunFolder:
         now = json.loads(json.dumps(now))
         for name in [*now, *sorted(before.keys() - now.keys())]:
             was, is_now = (values.get(name, "not given") for values in (before, now))
+            if name in _PATHS and "not given" not in (was, is_now):
+                was, is_now = (str(self.located(str(value)).resolve()) for value in (was, is_now))
             if was != is_now:
                 raise InputError(
                     f"{self.path}: cannot resume, {name.replace('_', '-')} was {was} and is now {is_now}; "

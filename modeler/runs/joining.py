@@ -67,11 +67,17 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
     guess = dict(first.solution.trajectory) | {
         frame: alignments[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()
     }
+    made = RunFolder(out)
+    sequences = [
+        made.stored(RunFolder(run).located(part))
+        for run, opened in ((run_a, first), (run_b, second))
+        for part in opened.report["sequence"].split(" + ")
+    ]
     meta = RunMeta(
-        sequence=f"{first.report['sequence']} + {second.report['sequence']}",
+        sequence=" + ".join(sequences),
         seed=seed,
         prior="none",
-        settings={"joined": [str(run.absolute()) for run in (run_a, run_b)], "offset": offset, "pairs": pairs},
+        settings={"joined": [made.stored(run) for run in (run_a, run_b)], "offset": offset, "pairs": pairs},
         camera=_least_known([*first.parts, *second.parts]),
     )
     with locked(out):

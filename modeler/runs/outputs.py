@@ -92,16 +92,17 @@ def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, 
             continue
         found[run] = None
         try:
-            report = RunFolder(run).report()
+            folder = RunFolder(run)
+            report = folder.report()
         except InputError:
             continue
         settings = report.get("settings")
         settings = settings if isinstance(settings, dict) else {}
         if isinstance(settings.get("joined"), list):
-            waiting += [Path(part) for part in settings["joined"] if isinstance(part, str)]
+            waiting += [folder.located(part) for part in settings["joined"] if isinstance(part, str)]
             continue
         files = (report.get("sequence"), settings.get("sensor"), settings.get("camera"))
-        found |= {Path(file): None for file in files if isinstance(file, str)}
+        found |= {folder.located(file): None for file in files if isinstance(file, str)}
     return (*found, *moved)
 
 

@@ -145,18 +145,19 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
     """Return the parts of a run; `within` are the joined runs that contain it, from the outermost."""
     if run.resolve() in within:
         raise InputError(f"{run}: is part of itself; join its parts again")
-    report = RunFolder(run).result()
+    folder = RunFolder(run)
+    report = folder.result()
     settings = report["settings"]
     if "joined" in settings:
-        first, second = (_parts(Path(part), places, (*within, run.resolve())) for part in settings["joined"])
+        first, second = (_parts(folder.located(part), places, (*within, run.resolve())) for part in settings["joined"])
         moved = (replace(part, offset=part.offset + int(settings["offset"])) for part in second)
         return (*first, *moved)
     if places is not None and not places:
         raise InputError(f"`sequence` is given too few times; give that of {run}, too, in order")
-    where = Path(report["sequence"]) if places is None else places.popleft()
+    where = folder.located(report["sequence"]) if places is None else places.popleft()
     if not where.exists():
         raise InputError(f"{where}: the sequence of {run} does not exist; give its new place with `sequence`")
-    sensor, camera = (Path(settings[name]) if name in settings else None for name in ("sensor", "camera"))
+    sensor, camera = (folder.located(settings[name]) if name in settings else None for name in ("sensor", "camera"))
     return (Part(run, report, calibrated(open_sequence(where, _overrides(settings)), sensor, camera)),)
 
 
