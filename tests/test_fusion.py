@@ -114,6 +114,24 @@ def test_a_plate_thinner_than_the_band_keeps_both_sides():
         assert face.mean() == pytest.approx(PLATE.half_m[1], abs=0.1 * VOXEL_M)
 
 
+@pytest.mark.parametrize("off_m", [0.0, 1e-3])
+def test_a_sheet_without_thickness_keeps_both_sides_also_where_views_see_them_swapped(off_m):
+    sheet = tabletop.Box((0.06, 1e-5, 0.05))
+    away = {k: se3.translation(pose[:3, 2] * off_m) @ pose for k, pose in tabletop.trajectory(POSES).items()}
+    model = FUSER.fuse(tabletop.views(sheet, POSES), away)
+    points = on_surface(model, 60000)
+    grid = np.stack(np.meshgrid(np.linspace(-0.05, 0.05, 21), [0.0], np.linspace(-0.04, 0.04, 17)), axis=-1)
+    corners = model.vertices_m[model.triangles]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 1]
+    assert np.quantile(np.abs(points[:, 1]), 0.99) < VOXEL_M
+    assert np.abs(points[:, 1]).max() < 1.5 * VOXEL_M
+    for side in (-1.0, 1.0):
+        assert np.count_nonzero(side * model.normals[:, 1] > 0.9) > 1000  # of the cloud
+    assert KDTree(points).query(grid.reshape(-1, 3))[0].max() < VOXEL_M
+    for side in (-1.0, 1.0):  # half of the area of both faces, 0.12 m by 0.1 m, each
+        assert 0.5 * np.sum(np.maximum(side * facing, 0.0)) == pytest.approx(0.012, rel=0.1)
+
+
 def haunted(ghost_depth_m: float = 0.77) -> dict[int, RayImage]:
     """Return views of the ball; in the first one a patch that is not there hangs beside it, as part of the object."""
     views = tabletop.views(BALL, POSES)

@@ -12,7 +12,7 @@ import tabletop
 from scipy.spatial import KDTree
 
 from modeler.fusion import Fuser, depth_views
-from modeler.fusion.fuser import downsampled, voxel_means
+from modeler.fusion.fuser import HALVES, downsampled, voxel_means
 from modeler.fusion.support import _solved
 from modeler.system.disk_arrays import DiskArrays, ViewStore
 
@@ -87,9 +87,20 @@ def test_clouds_are_averaged_together_as_they_are_at_once() -> None:
     clouds = [(points_m[part], normals[part], weights[part]) for part in (slice(0, 900), slice(900, None))]
     boxes_m = np.array([[cloud[0].min(axis=0), cloud[0].max(axis=0)] for cloud in clouds])
     together = voxel_means(clouds, boxes_m, voxel_m=0.01, max_voxels=10**6)
-    assert len(at_once[0]) == 125
+    places = np.floor((points_m - points_m.min(axis=0)) / 0.01)
+    assert len(at_once[0]) == len(np.unique(np.column_stack([places, normals @ HALVES > 0.0]), axis=0))
     for one, other in zip(at_once, together, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_both_sides_of_a_sheet_stay_in_the_cloud() -> None:
+    rng = np.random.default_rng(0)
+    points_m = rng.uniform(0.0, 0.05, (2000, 3)) * [1.0, 1.0, 0.0]
+    normals = np.where(np.arange(2000)[:, None] % 2, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
+    found_m, directions = downsampled(points_m, normals, np.ones(2000), voxel_m=0.01, max_voxels=10**6)
+    np.testing.assert_array_equal(np.abs(directions[:, 2]), 1.0)
+    for side in (-1.0, 1.0):
+        assert np.count_nonzero(directions[:, 2] == side) == len(found_m) / 2 == 25
 
 
 @pytest.mark.parametrize("shape", [(5, 9), (9, 5)])

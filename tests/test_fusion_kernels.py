@@ -92,7 +92,7 @@ def naive_wall(voxel, vote, other, views):
     return n >= 0 and normals[n] @ normal > tsdf.SAME_SIDE and abs(normals[n] @ (crossing - points[n])) < -along
 
 
-def naive_integrate(voxels, tau_m, empty_weight, views):
+def naive_integrate(voxels, tau_m, empty_weight, voxel_m, views):
     """Twin of `tsdf.integrate` for single voxels (n, 3)."""
     index, free_m, poses, intrinsics, points, normals, weights = views
     values, totals = np.zeros(len(voxels)), np.zeros(len(voxels))
@@ -116,10 +116,14 @@ def naive_integrate(voxels, tau_m, empty_weight, views):
             best = naive_side(votes, remaining, tau_m)
             side = [k for k in remaining if votes[k][2] @ votes[best][2] > tsdf.SAME_SIDE]
             weight = sum(votes[k][1] for k in side)
-            excess = max(0.0, emptiness - weight)
-            values[number] = excess * tau_m + sum(votes[k][1] * votes[k][0] for k in side)
+            distance = sum(votes[k][1] * votes[k][0] for k in side) / weight
+            opposite = [k for k in remaining if votes[k][2] @ votes[best][2] < -tsdf.SAME_SIDE]
+            if opposite:
+                behind = sum(votes[k][1] * votes[k][0] for k in opposite) / sum(votes[k][1] for k in opposite)
+                if -2 * tsdf.THINNEST * voxel_m < distance + behind < tau_m - 2 * voxel_m:
+                    distance = abs(distance - behind) / 2 - tsdf.THINNEST * voxel_m
             totals[number] = max(emptiness, weight)
-            values[number] /= totals[number]
+            values[number] = (max(0.0, emptiness - weight) * tau_m + weight * distance) / totals[number]
             against = [k for k in remaining if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
             if len(against) < tsdf.MAJORITY * len(side):
                 break
@@ -161,13 +165,13 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
     values, totals = tsdf.integrate(blocks, origin, voxel_m, tau_m, 0.3, np.arange(count) // own, *views)
     inner = np.stack(np.meshgrid(*[np.arange(tsdf.SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     voxels = origin + ((blocks[:, None] * tsdf.SIDE + inner).reshape(-1, 3) + 0.5) * voxel_m
-    expected_values, expected_totals = naive_integrate(voxels, tau_m, 0.3, views)
+    expected_values, expected_totals = naive_integrate(voxels, tau_m, 0.3, voxel_m, views)
     assert 0.0 < (expected_totals > 0.0).mean() <= 1.0
     np.testing.assert_allclose(totals.ravel(), expected_totals, rtol=1e-5)
     np.testing.assert_allclose(values.ravel(), expected_values, rtol=1e-4, atol=1e-8)
     monkeypatch.setattr(tsdf, "MAJORITY", 1000)  # of the twin alone
     if one_mind:  # some votes were rejected
-        assert np.any(naive_integrate(voxels, tau_m, 0.3, views)[1] != expected_totals)
+        assert np.any(naive_integrate(voxels, tau_m, 0.3, voxel_m, views)[1] != expected_totals)
 
 
 def level_of(values):

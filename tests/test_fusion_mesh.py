@@ -196,6 +196,19 @@ def test_smoothing_moves_with_the_mesh_and_leaves_what_is_sure_or_smooth(rng: np
     np.testing.assert_array_equal(meshing.without_relief(exact_m, nothing, limits_m), exact_m)
 
 
+def test_pieces_stay_where_enough_of_them_is_confirmed() -> None:
+    """Two spheres, of which the upper half of one is confirmed."""
+    vertices_m = np.concatenate([ICOSPHERE.vertices, ICOSPHERE.vertices + np.eye(3)[0]])
+    triangles = np.concatenate([TRIANGLES, TRIANGLES + len(ICOSPHERE.vertices)])
+    confirmed = (np.arange(len(vertices_m)) >= len(ICOSPHERE.vertices)) & (vertices_m[:, 2] > 0.0)
+    half_m2 = 2.0 * np.pi * RADIUS_M**2
+    second = np.arange(len(triangles)) >= len(TRIANGLES)
+    for share, kept in ((0.8, second), (1.0, np.zeros_like(second))):
+        found = meshing.confirmed_pieces(vertices_m, triangles, confirmed, share * half_m2)
+        np.testing.assert_array_equal(found, kept)
+    assert not len(meshing.confirmed_pieces(vertices_m, triangles[:0], confirmed, half_m2))
+
+
 def test_grown_marks_reach_as_many_rings_as_asked() -> None:
     one = np.zeros(len(ICOSPHERE.vertices), dtype=bool)
     one[0] = True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,7 +31,9 @@ from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage, S
 # Exponents of the view weights for colours: an average of views for vertices, nearly one view for textures, where an
 # average blurs. Chosen by hand.
 SOFT, SHARP = 4.0, 16.0
+CONFIRMED = 2  # views that see the same surface: thin parts that one view alone sees are errors along its outline
 FOLD_RINGS = 8  # rings of triangles along borders that may fold over; chosen by hand
+HALVES = np.array([0.36, 0.48, 0.8])  # divides directions in two halves; chosen by hand, along no axis
 MIN_NEIGHBOURS = 6  # points of the cloud with fewer in 27 cells of two voxels are outliers; a plane has some 36
 FINEST_PX = 0.01  # smallest voxel, in pixel footprints: a hundred voxels per pixel resolve nothing
 _MAX_VIEWS = 60  # by which an error of the focal length widens the surface's, spread over a run: more are redundant
@@ -238,9 +240,10 @@ class FusionVolume:
         for _ in range(self.fuser.closing):
             field = filled(field)
         vertices, triangles = meshing.extracted_mesh(field)
-        kept, weak, sigmas_m = self._kept(vertices, triangles)
+        kept, confirmed, weak, sigmas_m = self._kept(vertices, triangles)
         shown = triangles[np.all(kept[triangles], axis=1)]
-        shown = shown[meshing.large_pieces(vertices, shown, self.fuser.min_piece)]
+        large = meshing.large_pieces(vertices, shown, self.fuser.min_piece)
+        shown = shown[large | meshing.confirmed_pieces(vertices, shown, confirmed, self.near_m**2)]
         used, compact = meshing.used_vertices(shown, len(vertices))
         if watertight:
             return self._closed_mesh(field, vertices, used, weak, sigmas_m)
@@ -248,10 +251,11 @@ class FusionVolume:
         smooth = meshing.taubin_smoothed(smooth, compact, meshing.WEAK_PASSES, weak[used])
         return meshing.without_relief(smooth, compact, sigmas_m[used]), compact, np.ones(len(used), dtype=bool)
 
-    def _kept(self, vertices: Array, triangles: meshing.Triangles) -> tuple[BoolArray, BoolArray, Array]:
-        """Return which vertices (v,) of the zero level set are surface, which have weak support, and their sd in m.
+    def _kept(self, vertices: Array, triangles: meshing.Triangles) -> tuple[BoolArray, BoolArray, BoolArray, Array]:
+        """Return which vertices (v,) are surface, which of these are confirmed, which are weak, and their sd in m.
 
-        Surface is supported, not seen empty by several views, and does not fold over at a border.
+        Surface is supported, not seen empty by several views, and does not fold over at a border; more than one view
+        confirms it; weak is what has little support.
         """
         normals = meshing.normals_of(vertices, triangles)
         found = self._support(vertices, normals, Exposure.blind(self.views.count))
@@ -263,8 +267,9 @@ class FusionVolume:
         loose = meshing.folded(vertices, normals, seen, marked & ~seen)
         marked = meshing.without_loose_border(marked, loose, triangles, FOLD_RINGS)
         usual = float(np.median(found.weight[marked])) if marked.any() else 0.0
-        kept = meshing.spikes_removed(marked, triangles, self.fuser.opening)
-        return kept, found.weight < meshing.WEAK * usual, found.sigmas_m
+        confirmed = marked & seen & (found.views >= CONFIRMED)
+        kept = meshing.spikes_removed(marked, triangles, self.fuser.opening) | confirmed
+        return kept, confirmed, found.weight < meshing.WEAK * usual, found.sigmas_m
 
     def _closed_mesh(
         self,
@@ -299,7 +304,7 @@ def downsampled(
 def voxel_means(
     clouds: Iterable[tuple[Array, Array, Array]], boxes_m: Array, *, voxel_m: float, max_voxels: int
 ) -> tuple[Array, Array]:
-    """Average the oriented points of several clouds over voxels.
+    """Average the oriented points of several clouds over voxels, those on opposite sides of a sheet apart.
 
     Args:
         clouds: points (n, 3), normals (n, 3) and weights (n,) of each.
@@ -315,20 +320,27 @@ def voxel_means(
         voxel_m *= 1.25
     shape = (np.ceil((high - low) / voxel_m) + 1.0).astype(np.int64)
     voxels, sums = np.zeros(0, dtype=np.int64), np.zeros((0, 7))
-    for points_m, normals, weights in clouds:
+    halves = (side for cloud in clouds for side in _sides(*cloud))
+    for half, (points_m, normals, weights) in halves:
         cells, count = point_clouds.voxel_numbers(points_m, low, voxel_m, shape)
         some, totals = point_clouds.voxel_sums(cells, count, weights, np.concatenate([points_m, normals], axis=1))
         firsts = np.empty(count, dtype=np.int64)
         firsts[cells[::-1]] = np.arange(len(cells))[::-1]  # the last assignment counts
         places = np.floor((points_m[firsts] - low) / voxel_m).astype(np.int64)
-        voxels = np.concatenate([voxels, np.ravel_multi_index(tuple(places.T), tuple(shape))])
+        voxels = np.concatenate([voxels, 2 * np.ravel_multi_index(tuple(places.T), tuple(shape)) + half])
         sums = np.concatenate([sums, np.concatenate([some, totals[:, None]], axis=1)])
         voxels, sums = _summed(voxels, sums)
     means = sums[:, :6] / sums[:, 6:]
     lengths = np.linalg.norm(means[:, 3:], axis=1)
-    # Opposite sides of a sheet thinner than a voxel cancel: such a point has no normal and is left out.
-    kept = lengths > 0.1
+    kept = lengths > 0.1  # the rest has no normal
     return means[kept, :3], means[kept, 3:] / lengths[kept, None]
+
+
+def _sides(points_m: Array, normals: Array, weights: Array) -> Iterator[tuple[int, tuple[Array, Array, Array]]]:
+    """Yield the oriented points of either half of all directions, so that both sides of a sheet do not cancel."""
+    ahead = normals @ HALVES > 0.0
+    for half, chosen in enumerate((ahead, ~ahead)):
+        yield half, (points_m[chosen], normals[chosen], weights[chosen])
 
 
 def _summed(keys: npt.NDArray[np.int64], values: Array) -> tuple[npt.NDArray[np.int64], Array]:

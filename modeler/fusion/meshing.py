@@ -203,6 +203,22 @@ def large_pieces(vertices_m: Array, triangles: Triangles, min_share: float) -> B
     return (area >= min_share * area.max())[piece]
 
 
+def confirmed_pieces(vertices_m: Array, triangles: Triangles, confirmed: BoolArray, least_m2: float) -> BoolArray:
+    """Return which triangles (t,) belong to connected components of which an area of at least `least_m2` is confirmed.
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3).
+        confirmed: (v,) which vertices are; a triangle is, if all of its vertices are.
+        least_m2: least area.
+    """
+    if not len(triangles):
+        return np.zeros(0, dtype=bool)
+    piece = _piece(triangles, len(vertices_m))
+    areas = areas_of(vertices_m, triangles) * np.all(confirmed[triangles], axis=1)
+    return (np.bincount(piece, weights=areas) >= least_m2)[piece]
+
+
 def solid_pieces(vertices_m: Array, triangles: Triangles) -> BoolArray:
     """Return which triangles (t,) belong to the closed component of the largest volume."""
     if not len(triangles):

@@ -19,6 +19,7 @@ from modeler.kernels.threads import over_rows
 
 SIDE = 4  # voxels along the side of a block
 SAME_SIDE = 0.3  # least cosine between normals on the same side of the object; chosen by hand
+THINNEST = 0.75  # half the least thickness of sheets, in voxels: two sides in one and a half are resolved
 MAJORITY = 3  # a side is rejected if this many times as many votes contradict it; chosen by hand
 
 
@@ -118,6 +119,7 @@ def _integrate(
                     number[voxel],
                     empty_weight * empty[voxel],
                     tau_m,
+                    voxel_m,
                     views,
                     index,
                     poses,
@@ -307,13 +309,27 @@ def facing(first, i, second, k):
 
 @njit(cache=True)
 def fuse_votes(
-    position, seen, distance, weight, number, emptiness, tau_m, views, index, poses, intrinsics, points, normals
+    position,
+    seen,
+    distance,
+    weight,
+    number,
+    emptiness,
+    tau_m,
+    voxel_m,
+    views,
+    index,
+    poses,
+    intrinsics,
+    points,
+    normals,
 ):
     """Return the signed distance and weight of a position from its votes (eq. 12.6). Rejected votes get weight 0.
 
-    Only votes on the same side of the object as the dominant vote are averaged. A side is rejected if most votes see
-    surface between it and its view: a few pixels at grazing angles, with errors along their rays far beyond the noise,
-    seem to look out from within the object.
+    Only votes on the same side of the object as the dominant vote are averaged. Where errors bring both sides of a
+    sheet closer than a mesh can have them, or swap them, the sheet has its least thickness about their middle. A side
+    is rejected if most votes see surface between it and its view: a few pixels at grazing angles, with errors along
+    their rays far beyond the noise, seem to look out from within the object.
 
     Args:
         position: (3,) in the object frame.
@@ -323,6 +339,7 @@ def fuse_votes(
         number: (f,) surface point of each.
         emptiness: sum of the weights of the views that see the position empty.
         tau_m: half width of the truncation band.
+        voxel_m: side of a voxel.
         views: (n,) the view of each surface point.
         index: (f, h, w) int32.
         poses: (f, 3, 4) camera_from_object.
@@ -337,6 +354,7 @@ def fuse_votes(
             return tau_m, emptiness
         side = number[best]
         total, value, agreeing = 0.0, 0.0, 0
+        behind, behind_value = 0.0, 0.0
         for k in range(seen):
             n = number[k]
             cosine = (
@@ -346,6 +364,13 @@ def fuse_votes(
                 total += weight[k]
                 value += weight[k] * distance[k]
                 agreeing += 1
+            elif cosine < -SAME_SIDE and weight[k] > 0.0:
+                behind += weight[k]
+                behind_value += weight[k] * distance[k]
+        if behind > 0.0:  # below eq. 12.6
+            mean, other = value / total, behind_value / behind
+            if -2.0 * THINNEST * voxel_m < mean + other < tau_m - 2.0 * voxel_m:
+                value = total * (0.5 * abs(mean - other) - THINNEST * voxel_m)
         # eq. 12.5: what few views see through does not move surface that more see.
         excess = max(0.0, emptiness - total)
         result = (value + excess * tau_m) / (total + excess), total + excess
