@@ -13,6 +13,7 @@ from scipy import stats
 from modeler import se3
 from modeler.kernels import planes
 from modeler.runs.known_objects import known_object
+from modeler.sequences.rendering.recipe import Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.tracking import ModelRenderer, Tracked, Tracker
 from modeler.tracking.errors import of_the_camera, of_the_model
@@ -20,6 +21,8 @@ from modeler.types import Array, Camera, InputError, ObjectModel
 from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, staged
+from studies.tracking.clutter import model_of as model_on_table
+from studies.tracking.clutter import noise, scene
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
 
@@ -90,6 +93,30 @@ def test_another_object_is_not_there(shown: str, sought: str) -> None:
         assert found.pose is None
         assert found.reason
         assert not found.usable
+
+
+def test_an_object_is_found_and_followed_without_masks() -> None:
+    sequence, model = rendered("boot", 4, 6.0)
+    tracker, truth = Tracker(model, Sensor(sequence.sensor())), sequence.truth()
+    for frame in sequence:
+        found = tracker.update(replace(frame, mask=None))
+        assert found.outcome == ("found" if frame.index == 0 else "followed")
+        assert found.pose is not None
+        assert np.degrees(se3.rotation_angle(se3.inverse(found.pose.mean) @ truth[frame.index])) < 1.5
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_on_a_table_with_others_an_object_is_found_or_not_there(there: bool) -> None:
+    sought, others = "stapler", ("whistle", "boot", "can")
+    shown = scene(sought if there else None, others, 3, hidden=False)
+    view = Viewpoint()
+    found = Tracker(model_on_table(sought), Sensor(noise(view.distance_m, view))).update(shown.frame)
+    if not there:
+        assert found.outcome == "not there"
+        return
+    assert found.pose is not None
+    assert shown.camera_from_model is not None
+    assert np.degrees(se3.rotation_angle(se3.inverse(found.pose.mean) @ shown.camera_from_model)) < 1.5
 
 
 def test_the_turn_of_a_can_about_its_axis_is_open_and_its_pose_of_use() -> None:

@@ -81,26 +81,36 @@ class ViewpointSearch:
     search: Search = field(default_factory=Search)
     """Stages and steps of a descent."""
 
-    def poses(
-        self, renderer: ModelRenderer, viewpoints: Viewpoints, view: RayImage, sensor: Sensor, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
+    def roughly(self, viewpoints: Viewpoints, view: RayImage, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return camera_from_model (k, 4, 4), the likeliest first, and their log-likelihoods (k,) in nats.
 
-        No two are within a basin of attraction.
+        They are those of few points at a coarse resolution, without colours. No two are within a basin of attraction.
+
+        Args:
+            viewpoints: around the model, at about its distance.
+            view: the frame, segmented.
+            rng: source of all randomness.
+        """
+        return _ranked(
+            [
+                self._from_viewpoint(seen, start, view, rng)
+                for start, seen in zip(viewpoints.camera_from_model, viewpoints.views, strict=True)
+            ]
+        )
+
+    def again(
+        self, renderer: ModelRenderer, poses: Array, view: RayImage, sensor: Sensor, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return the best of rough poses (n, 4, 4) after descent in finer views of the model there, as `roughly` does.
 
         Args:
             renderer: of the model.
-            viewpoints: around it, at about its distance.
+            poses: camera_from_model, the likeliest first.
             view: the frame, segmented.
             sensor: of the frame.
             rng: source of all randomness.
         """
-        found = [
-            self._from_viewpoint(seen, start, view, rng)
-            for start, seen in zip(viewpoints.camera_from_model, viewpoints.views, strict=True)
-        ]
-        first, _ = _ranked(found)
-        return _ranked([self._again(renderer, pose, view, sensor, rng) for pose in first[: self.refined]])
+        return _ranked([self._again(renderer, pose, view, sensor, rng) for pose in poses[: self.refined]])
 
     def _from_viewpoint(
         self, seen: RayImage, camera_from_model: Array, view: RayImage, rng: np.random.Generator

@@ -13,12 +13,15 @@ import numpy as np
 from modeler import se3
 from modeler.fusion import SymmetryFinder
 from modeler.fusion.symmetries import Symmetries
-from modeler.pipeline.pairs import Prepared, prepare
+from modeler.kernels import point_likelihood
+from modeler.pipeline.pairs import prepare
 from modeler.priors.mixtures import KernelMixture
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.posterior import MIN_MODE_SHARE
+from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.search import Search
 from modeler.segmentation import Scene, Segmenter
+from modeler.tracking.candidates import CandidateFinder
 from modeler.tracking.errors import free_directions, of_the_camera, of_the_model
 from modeler.tracking.rendering import ModelRenderer
 from modeler.tracking.search import Viewpoints, ViewpointSearch
@@ -46,8 +49,11 @@ USABLE_RAD, USABLE_M = np.radians(3.0), 0.005
 _SIGMA_RAD, _SIGMA = 0.12, 0.15  # of a pose found by the search: rotation, and shift in units of the object's size
 _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames before
 _MOST_STEPS = 3.0  # over which a velocity is extrapolated
+_OVERLAP, _SHOWN = 0.6, 0.15  # least, with any rotation: a small part of a model looks like many things
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
 _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
+_MOST_TRIED = 3  # of the segments of a frame, the likeliest
 _RIVAL_NATS = 12.0  # below the best pose, a search's pose is negligible
 
 
@@ -104,7 +110,9 @@ class Tracker:
     search: ViewpointSearch = field(default_factory=ViewpointSearch)
     """Finds poses with any rotation."""
     segmenter: Segmenter = field(default_factory=Segmenter)
-    """Finds objects in frames without masks."""
+    """Finds the support, and the object in frames without masks whose scene is known."""
+    finder: CandidateFinder = field(default_factory=CandidateFinder)
+    """Finds what may be the object where no mask says, and the scene does not show it."""
     scene: Scene = field(default_factory=Scene)
     """As the segmenter estimated it from a sequence, if it is known beforehand."""
     seed: int = 0
@@ -143,8 +151,7 @@ class Tracker:
             InputError: if the prior does not apply to it, or the model is far too large or small for what is in it.
         """
         began_s = time.perf_counter()
-        prepared = prepare(frame, self.scene, self.segmenter, self.sensor)
-        found = self._placed(frame, prepared)
+        found = self._placed(frame, np.random.default_rng([self.seed, max(frame.index, 0)]))
         found = replace(found, seconds=time.perf_counter() - began_s)
         if found.pose is None:
             self.newest.clear()
@@ -152,21 +159,39 @@ class Tracker:
             self.newest = [*self.newest[-1:], found]
         return found
 
-    def _placed(self, frame: Frame, prepared: Prepared) -> Tracked:
-        """Return the object in a frame."""
-        view = prepared.view
-        if view is None or len(view.points_m) < self.registrar.min_points:
-            return Tracked(frame.index, frame.time_s, "too few points", reason="no segment is large enough")
-        rng = np.random.default_rng([self.seed, max(frame.index, 0)])
-        if self.newest and not self.independent:
-            followed = self._followed(view, rng)
+    def _placed(self, frame: Frame, rng: np.random.Generator) -> Tracked:
+        """Return the object in a frame: in its mask, in what the scene shows to move, or anywhere."""
+        nothing = Tracked(frame.index, frame.time_s, "too few points", reason="no segment is large enough")
+        segmented = frame.mask is not None or self.scene.still or self.scene.alone
+        if segmented:
+            view = self._view(frame)
+            found = nothing if view is None else self._followed(view, rng) or self._found([view], rng)
+            if found.pose is not None or frame.mask is not None:
+                return found
+        clear = frame.unoccluded
+        if self._follows:
+            view = self._view(replace(clear, mask=self.finder.near(clear, self._predicted(frame), self.renderer)))
+            followed = None if view is None else self._followed(view, rng)
             if followed is not None:
                 return followed
-        return self._found(view, rng)
+        views = [self._view(replace(clear, mask=mask)) for mask in self.finder.masks(clear, self.renderer)]
+        return self._found([view for view in views if view is not None], rng, nothing)
+
+    @property
+    def _follows(self) -> bool:
+        """Whether the frames before say where the object is."""
+        return bool(self.newest) and not self.independent
+
+    def _view(self, frame: Frame) -> RayImage | None:
+        """Return a frame prepared for registration; None if too little of an object is seen."""
+        view = prepare(frame, self.scene, self.segmenter, self.sensor).view
+        return None if view is None or len(view.points_m) < self.registrar.min_points else view
 
     def _followed(self, view: RayImage, rng: np.random.Generator) -> Tracked | None:
-        """Return the object as predicted from the frames before, None if the images contradict that."""
-        last, expected = self.newest[-1], self._predicted(view)
+        """Return the object as predicted from the frames before, None if nothing is or the images contradict that."""
+        if not self._follows:
+            return None
+        last, expected = self.newest[-1], self._predicted(view.frame)
         assert last.pose is not None
         assert last.view is not None
         if self.prior is None:
@@ -190,13 +215,13 @@ class Tracker:
             return None
         return self._tracked(view, "followed", [(1.0, posterior, expected)])
 
-    def _predicted(self, view: RayImage) -> Array:
+    def _predicted(self, frame: Frame) -> Array:
         """Return camera_from_model (4, 4) as constant velocity predicts it."""
         poses = [one.pose.mean for one in self.newest if one.pose is not None]
         if len(poses) < 2:
             return poses[-1]
         (first, last), before = self.newest, poses[0]
-        pace = (view.frame.time_s - last.time_s) / max(last.time_s - first.time_s, 1e-9)
+        pace = (frame.time_s - last.time_s) / max(last.time_s - first.time_s, 1e-9)
         if not 0.0 < pace <= _MOST_STEPS:
             return poses[-1]
         # Motion of the object about its own centre, so that a turn does not swing it about the camera.
@@ -204,30 +229,52 @@ class Tracker:
         step = se3.log(se3.inverse(before @ about) @ poses[-1] @ about)
         return poses[-1] @ about @ se3.exp(pace * step) @ se3.inverse(about)
 
-    def _found(self, view: RayImage, rng: np.random.Generator) -> Tracked:
-        """Return the object with any rotation."""
-        renderer = self.renderer
-        self._check_size(view)
-        distance_m = float(np.linalg.norm(view.centroid_m)) + 0.5 * renderer.radius_m
-        poses, scores = self.search.poses(renderer, self._viewpoints(view, distance_m), view, self.sensor, rng)
+    def _found(self, views: Sequence[RayImage], rng: np.random.Generator, nothing: Tracked | None = None) -> Tracked:
+        """Return the object with any rotation.
+
+        Args:
+            views: of the frame, each with another mask.
+            rng: source of all randomness.
+            nothing: what is returned without any view.
+        """
+        rough = []
+        for view in views:
+            self._check_size(view)
+            distance_m = float(np.linalg.norm(view.centroid_m)) + 0.5 * self.renderer.radius_m
+            poses, scores = self.search.roughly(self._viewpoints(view, distance_m), view, rng)
+            rough += [(scores[0], poses, view)] if len(poses) else []
+        rough.sort(key=lambda one: -one[0])
+        absent = nothing
+        for _, poses, view in rough[:_MOST_TRIED]:
+            found = self._in_view(view, poses, rng)
+            if found.pose is not None:
+                return found
+            absent = absent if absent is not None and absent.outcome == "not there" else found
+        assert absent is not None
+        return absent
+
+    def _in_view(self, view: RayImage, rough: Array, rng: np.random.Generator) -> Tracked:
+        """Return the object in a view, near one of rough poses (k, 4, 4), the likeliest first."""
+        absent = Tracked(view.index, view.frame.time_s, "not there", reason="no view of the model fits", view=view)
+        poses, scores = self.search.again(self.renderer, rough, view, self.sensor, rng)
         if not len(poses):
-            return Tracked(view.index, view.frame.time_s, "not there", reason="no view of the model fits", view=view)
+            return absent
         likely = poses[scores > scores[0] - _RIVAL_NATS][: self.registrar.max_modes]
         registered = [(self._registered(view, pose, rng), pose) for pose in likely]
         convincing = [(posterior, pose) for posterior, pose in registered if posterior.convincing]
         if not convincing:
             best = registered[0][0]
-            return Tracked(
-                view.index,
-                view.frame.time_s,
-                "not there",
-                overlap=best.overlap,
-                reason="the images contradict the likeliest pose" if best.usable else best.outcome.label,
-                view=view,
-            )
-        weights = self._weights(view, convincing, rng)
+            reason = "the images contradict the likeliest pose" if best.usable else best.outcome.label
+            return replace(absent, overlap=best.overlap, reason=reason)
+        pairs = [self._pair(view, se3.inverse(posterior.pose.mean) @ pose, rng) for posterior, pose in convincing]
+        shown = [_share_shown(pair) for pair in pairs]
+        kept = [k for k, (posterior, _) in enumerate(convincing) if posterior.overlap > _OVERLAP and shown[k] > _SHOWN]
+        if not kept:
+            reason = f"only {100.0 * max(shown):.0f} % of the model's surface matches"
+            return replace(absent, overlap=convincing[0][0].overlap, reason=reason)
+        weights = self._weights([pairs[k] for k in kept], view)
         order = np.argsort(-weights, kind="stable")
-        return self._tracked(view, "found", [(float(weights[k]), *convincing[k]) for k in order])
+        return self._tracked(view, "found", [(float(weights[k]), *convincing[kept[k]]) for k in order])
 
     def _check_size(self, view: RayImage) -> None:
         """Reject a model whose lengths cannot be m, as it is far larger or smaller than what the frame shows.
@@ -249,24 +296,21 @@ class Tracker:
         seen = self.renderer.view(pose, view.frame.camera, self.sensor)
         return self.registrar.register(view, seen, _near(view, _SIGMA_RAD, _SIGMA), rng=rng)
 
-    def _weights(
-        self, view: RayImage, registered: Sequence[tuple[Posterior, Array]], rng: np.random.Generator
-    ) -> Array:
-        """Return relative weights (k,) of registrations, each about a pose (4, 4) at which the model was rendered.
+    def _pair(self, view: RayImage, camera_from_model: Array, rng: np.random.Generator) -> PairLikelihood:
+        """Return the likelihood of a frame and the model in a pose (4, 4)."""
+        reached = self.renderer.view(camera_from_model, view.frame.camera, self.sensor)
+        return self.registrar.likelihood.between(view, reached, rng)
+
+    def _weights(self, pairs: Sequence[PairLikelihood], view: RayImage) -> Array:
+        """Return relative weights (k,) of poses, each given as the pair of frame and model in it.
 
         They are those of Gaussians about the means (Laplace), under the noise of the one that matches best.
         """
-        if len(registered) == 1:
-            return np.ones(1)
-        pairs = []
-        for posterior, pose in registered:
-            reached = self.renderer.view(se3.inverse(posterior.pose.mean) @ pose, view.frame.camera, self.sensor)
-            pairs.append(self.registrar.likelihood.between(view, reached, rng).without_holes())
         here, fine_m = np.eye(4), self.registrar.search.fine_m(pairs[0])
         blur_m = max(min(pair.noises_m(here, fine_m)[0] for pair in pairs), fine_m)
         widest = np.diag(1.0 / np.repeat([1.0, view.size_m], 3) ** 2)
         logs = [
-            pair.tempered(here[None], blur_m)[0]
+            pair.without_holes().tempered(here[None], blur_m)[0]
             - 0.5 * np.linalg.slogdet(pair.curvatures(here[None], blur_m, stride=1)[0] + widest)[1]
             for pair in pairs
         ]
@@ -334,17 +378,17 @@ class Tracker:
         return f"its place is uncertain by {1000.0 * sigma_m:.1f} mm" if sigma_m > USABLE_M else ""
 
     def _viewpoints(self, view: RayImage, distance_m: float) -> Viewpoints:
-        """Return the viewpoints at a distance, those of earlier frames if they suit."""
-        known = self._around
-        if not known or not known[0].suits(distance_m):
-            around = Viewpoints.around(
-                self.renderer, self.search.viewpoints, view.frame.camera, self.sensor, distance_m
-            )
-            self._around[:] = [around]
-        return self._around[0]
+        """Return the viewpoints at a distance, those of earlier searches if they suit."""
+        known = next((some for some in self._around if some.suits(distance_m)), None)
+        if known is None:
+            count, camera = self.search.viewpoints, view.frame.camera
+            known = Viewpoints.around(self.renderer, count, camera, self.sensor, distance_m)
+            self._around[:] = [*self._around[-(_MOST_AROUND - 1) :], known]
+        return known
 
     @cached_property
     def _around(self) -> list[Viewpoints]:
+        """The viewpoints of the last searches."""
         return []
 
 
@@ -364,6 +408,11 @@ def _near(view: RayImage, sigma_rad: float, sigma: float) -> KernelMixture:
         sigma_m=sigma * view.size_m,
         evidence=False,
     )
+
+
+def _share_shown(pair: PairLikelihood) -> float:
+    """Return the share of the model's surface that faces the camera and matches, with the model in the pose."""
+    return float(np.mean(pair.backward.classify(se3.rows(np.eye(4))) == point_likelihood.MATCHED))
 
 
 def _of_model(motion: PoseGaussian, rendered: Array) -> PoseGaussian:

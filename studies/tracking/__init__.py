@@ -1,0 +1,1 @@
+"""Objects found in images with their model, rendered and real, beside a baseline."""

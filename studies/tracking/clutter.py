@@ -1,0 +1,145 @@
+"""A cluttered table: the object that is sought among others, some of which hide it, seen by the renderer's camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, final
+
+import numpy as np
+import trimesh
+
+from modeler import se3
+from modeler.sequences.meshes import Mesh
+from modeler.sequences.rendering.depth_sensor import DepthSensor, Exposure
+from modeler.sequences.rendering.meshes import Caster, outer_surface
+from modeler.sequences.rendering.recipe import Viewpoint, builtin_recipes, load_recipe
+from modeler.sequences.rendering.renderer import surroundings
+from modeler.sequences.rendering.shapes import placement
+from modeler.types import Array, BoolArray, Frame, ObjectModel, SensorNoise
+from studies.calibration.specimens import load_specimen
+
+_SENSOR = DepthSensor()
+_UNIT_M = 0.001
+VIEW: Final = Viewpoint()
+"""The camera, 35° above a table 0.8 m away."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One image of a table."""
+
+    frame: Frame
+    """Depth alone, without a mask."""
+    mask: BoolArray
+    """(h, w) where the sought object is in front."""
+    visible: float
+    """Share (0..1) of its pixels that nothing hides; 0 where it is not there."""
+    camera_from_model: Array | None
+    """(4, 4) the truth; None where it is not there."""
+
+
+@cache
+def shape(name: str) -> Mesh:
+    """Return the outer surface of a shape, as it rests on a table about the origin."""
+    recipe = load_specimen(name)
+    mesh = outer_surface(recipe.object.mesh()).moved(placement((0.0, 0.0, 0.0), recipe.rest_rotation_deg))
+    low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
+    middle = 0.5 * (low + high)
+    return mesh.moved(placement((-middle[0], -middle[1], -low[2]), (0.0, 0.0, 0.0)))
+
+
+@cache
+def model_of(name: str) -> ObjectModel:
+    """Return the true model of a shape."""
+    mesh = trimesh.Trimesh(shape(name).vertices_m, shape(name).triangles, process=True)
+    empty = np.zeros((0, 3))
+    return ObjectModel(
+        points_m=empty,
+        normals=empty,
+        colours=None,
+        vertices_m=np.asarray(mesh.vertices, np.float64),
+        triangles=np.asarray(mesh.faces, np.int64),
+        vertex_normals=np.asarray(mesh.vertex_normals, np.float64),
+        vertex_colours=None,
+    )
+
+
+def noise(distance_m: float, view: Viewpoint) -> SensorNoise:
+    """Return the noise of the camera at a distance."""
+    return SensorNoise(*_SENSOR.sigmas(distance_m, view.focal_px, _UNIT_M))
+
+
+def scene(sought: str | None, others: tuple[str, ...], seed: int, *, hidden: bool, view: Viewpoint = VIEW) -> Scene:
+    """Return an image of shapes that stand on a table, turned and placed as the seed has it.
+
+    Args:
+        sought: name of the shape whose truth is returned, in the middle; None: it is not there.
+        others: names of those around it.
+        seed: of all randomness.
+        hidden: whether the first of the others stands before it.
+        view: the camera.
+    """
+    rng = np.random.default_rng(seed)
+    camera, camera_from_table = view.camera(), view.camera_from_table()
+    rays = np.stack([*camera.rays(), np.ones((camera.height, camera.width))], axis=-1)
+    table = surroundings(load_recipe(sorted(builtin_recipes())[0])).moved(camera_from_table)
+    placed: list[tuple[Caster, Array]] = [(Caster(table), np.eye(4))]
+    whole, seen = np.zeros(rays.shape[:2], dtype=bool), np.zeros(rays.shape[:2], dtype=bool)
+    pose: Array | None = None
+    reach_m = 0.0 if sought is None else _reach_m(sought)
+    around = rng.uniform(0.0, 2.0 * np.pi)
+    for number, name in enumerate((sought, *others)):
+        if name is None:
+            continue
+        if number == 0:
+            place_m = rng.uniform(-0.03, 0.03, 2)
+        elif number == 1 and hidden:  # towards the camera, to one side
+            place_m = np.array([rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.9) * reach_m, -(reach_m + _reach_m(name))])
+        else:
+            angle = around + 2.0 * np.pi * number / len(others) + rng.uniform(-0.3, 0.3)
+            apart_m = reach_m + _reach_m(name) + rng.uniform(0.02, 0.08)
+            place_m = apart_m * np.array([np.cos(angle), abs(np.sin(angle)) if hidden else np.sin(angle)])
+        turned = placement((place_m[0], place_m[1], 0.0), (0.0, 0.0, float(rng.uniform(0.0, 360.0))))
+        placed.append((Caster(shape(name)), camera_from_table @ turned))
+        if number == 0:
+            pose = camera_from_table @ turned
+    looked, nearest = None, np.full(rays.shape[:2], np.inf)
+    for number, (caster, camera_from_mesh) in enumerate(placed):
+        hits = caster.cast(rays, camera_from_mesh)
+        first = np.where(np.isnan(hits.depth_m), np.inf, hits.depth_m) < nearest
+        nearest = np.where(first, hits.depth_m, nearest)
+        looked = hits if looked is None else hits.over(looked, first)
+        if pose is not None and number == 1:
+            whole = np.isfinite(hits.depth_m)
+        seen = first if number == 1 and pose is not None else seen & ~first
+    assert looked is not None
+    lamp_m = np.array([_SENSOR.baseline_m, 0.0, 0.0])
+    shadowed = np.zeros(rays.shape[:2], dtype=bool)
+    for caster, camera_from_mesh in placed:
+        shadowed |= caster.blocks(lamp_m, looked.points_m, camera_from_mesh)
+    exposure = Exposure(looked.depth_m, looked.incidence_rad, shadowed)
+    depth_m = _SENSOR.measure(exposure, view.focal_px, rng)
+    visible = float(np.count_nonzero(seen & whole) / max(np.count_nonzero(whole), 1))
+    return Scene(Frame(seed, float(seed), depth_m, camera), seen & whole, visible if pose is not None else 0.0, pose)
+
+
+def _reach_m(name: str) -> float:
+    """Return the radius of a shape on the table."""
+    return float(np.linalg.norm(shape(name).vertices_m[:, :2], axis=1).max())
+
+
+def mssd_m(model: ObjectModel, found: Array, truth: Array, symmetries: tuple[Array, ...] = ()) -> float:
+    """Return BOP's maximum symmetry-aware surface distance of a pose (4, 4) in m.
+
+    Args:
+        model: whose vertices are compared.
+        found: camera_from_model.
+        truth: camera_from_model.
+        symmetries: (4, 4) rotations of the model onto itself, besides none.
+    """
+    vertices_m = model.vertices_m[:: max(len(model.vertices_m) // 2000, 1)]
+    at = se3.transform(found, vertices_m)
+    turns = (np.eye(4), *symmetries)
+    return float(min(np.linalg.norm(at - se3.transform(truth @ turn, vertices_m), axis=1).max() for turn in turns))
