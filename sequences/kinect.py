@@ -20,6 +20,7 @@ from modeler.sequences.input_files import Node, input_errors
 from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
 from modeler.sequences.lens import Alignment, Lens, coefficients
 from modeler.sequences.recording import AbstractStreams, paired
+from modeler.system.extras import install_command
 from modeler.system.regular_files import check_regular
 from modeler.types import Array, Camera, InputError
 
@@ -105,7 +106,7 @@ def _camera(calibration: Node, purpose: str) -> Node:
     raise InputError(f"{calibration.path}: its calibration knows no {purpose}; record it again.")
 
 
-ADVICE = "pip install -c constraints.txt -e '.[kinect]'"
+ADVICE = install_command("kinect")
 _AGAIN = "record or copy it again"
 
 

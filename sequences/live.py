@@ -17,6 +17,7 @@ from modeler.sequences.base import AbstractSequence, check_every, span
 from modeler.sequences.depth_files import metres
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens, coefficients
+from modeler.system.extras import install_command
 from modeler.types import Array, Camera, Frame, InputError, SensorNoise
 
 FIRST = 10
@@ -166,7 +167,7 @@ def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
 
 SCHEME = "realsense:"
 """Prefix of a path that selects a camera; its serial number may follow."""
-ADVICE = "a RealSense camera is read by its maker's library; pip install -c constraints.txt -e '.[realsense]'"
+ADVICE = f"a RealSense camera is read by its maker's library; {install_command('realsense')}"
 WARM_UP = 30
 """Images after which exposure has settled."""
 TIMEOUT_MS = 5000

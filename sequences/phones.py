@@ -18,10 +18,11 @@ from modeler.sequences.image_folders import FoundImages
 from modeler.sequences.input_files import Node, check_link, input_errors, is_there, read_tree
 from modeler.sequences.intrinsics import Overrides, camera_of
 from modeler.sequences.recording import AbstractRecording
+from modeler.system.extras import install_command
 from modeler.system.regular_files import open_regular, parse_json
 from modeler.types import Array, Camera, Frame, InputError
 
-ADVICE = "pip install -c constraints.txt -e '.[phones]'"
+ADVICE = install_command("phones")
 _AGAIN = "export it again"
 _MOST_BYTES = 64_000_000  # of a file in the archive
 

@@ -3,6 +3,7 @@
 import ctypes
 import importlib.util
 import runpy
+import sys
 
 import numpy as np
 import pytest
@@ -107,7 +108,7 @@ def test_a_device_is_chosen_for_large_work_only(monkeypatch):
 @pytest.mark.parametrize(
     ("absent", "line"),
     [
-        ("warp", "warp-lang is not installed; pip install -c constraints.txt -e '.[gpu]'"),
+        ("warp", f"warp-lang is not installed; {sys.executable} -m pip install 'modeler[gpu]'"),
         ("driver", "there is no NVIDIA driver"),
     ],
 )

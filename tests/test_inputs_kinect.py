@@ -196,7 +196,7 @@ def test_images_larger_than_their_track_are_bounded(tmp_path: Path, monkeypatch:
 def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "s.mkv").write_bytes(b"\x1aE\xdf\xa3")
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install -c constraints.txt -e '.\[kinect\]'"):
+    with pytest.raises(InputError, match=r"-m pip install 'modeler\[kinect\]'"):
         open_sequence(tmp_path / "s.mkv")
 
 

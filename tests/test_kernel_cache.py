@@ -30,7 +30,7 @@ from numba.core import event
 with event.install_recorder("numba:compile") as recorder:
     from toy import cache
     from toy.outer import outer
-    print(outer(1.0), len(recorder.buffer), cache.kept("outer", "outer"), cache.writable())
+    print(outer(1.0), len(recorder.buffer), cache.kept("outer", "outer"), cache.writable() is not None)
 """
 
 
@@ -47,7 +47,8 @@ def toy(tmp_path: Path) -> Path:
 
 def called(toy: Path, **settings: str) -> list[str]:
     """Return the result in a process of its own, the number of events of compiling, and the state of the cache."""
-    environment = {**os.environ, "PYTHONPATH": str(toy), "HOME": str(toy / "home"), **settings}
+    places = {"HOME": str(toy / "home"), "TMPDIR": str(toy / "temporary")}
+    environment = {**os.environ, "PYTHONPATH": str(toy), **places, **settings}
     ended = subprocess.run(
         [sys.executable, "-c", _CALL], env=environment, capture_output=True, text=True, check=False, timeout=100.0
     )
@@ -123,12 +124,22 @@ def test_kernels_of_other_settings_are_not_taken(toy: Path) -> None:
 
 @pytest.mark.parametrize("place", ["/dev/null/kernels", "/proc/kernels"])
 def test_where_nothing_can_be_written_kernels_stay_in_memory(toy: Path, place: str) -> None:
-    assert called(toy, NUMBA_CACHE_DIR=place, HOME=place)[::3] == ["2.0", "False"]
+    assert called(toy, NUMBA_CACHE_DIR=place, HOME=place, TMPDIR=place)[::3] == ["2.0", "False"]
     assert not files(toy)
 
 
+def test_where_neither_installation_nor_home_can_be_written_kernels_are_temporary(toy: Path) -> None:
+    first = called(toy, NUMBA_CACHE_DIR="/proc/kernels", HOME="/proc/home")
+    assert first[::3] == ["2.0", "True"]
+    assert int(first[1]) > 0
+    assert {path.parents[1] for path in files(toy)} == {toy / "temporary" / f"modeler-{os.geteuid()}"}
+    assert int(called(toy, NUMBA_CACHE_DIR="/proc/kernels", HOME="/proc/home")[1]) == 0
+    (toy / "temporary" / f"modeler-{os.geteuid()}").chmod(0o777)  # as if of somebody else
+    assert int(called(toy, NUMBA_CACHE_DIR="/proc/kernels", HOME="/proc/home")[1]) > 0
+
+
 def test_a_home_in_the_current_folder_is_none(toy: Path) -> None:
-    called(toy, NUMBA_CACHE_DIR="/dev/null/kernels", HOME="", XDG_CACHE_HOME="")
+    called(toy, NUMBA_CACHE_DIR="/dev/null/kernels", HOME="", XDG_CACHE_HOME="", TMPDIR="here")
     assert not files(toy)
 
 
@@ -136,10 +147,24 @@ def test_that_kernels_cannot_be_kept_is_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cache, "kept", lambda module, name: False)
-    monkeypatch.setattr(cache, "writable", lambda: False)
+    monkeypatch.setattr(cache, "writable", lambda: None)
     reports: list[Callable[[str], None]] = []
     monkeypatch.setattr(kernels, "on_compiling", reports.append)
     compiling.compile_kernels(say)
     assert capsys.readouterr().err.startswith(f"modeler: compiled kernels cannot be kept in {cache.folder()}")
     reports[0]("tsdf")
     assert "compiling kernels, for this command alone: 1 of" in capsys.readouterr().err
+
+
+def test_that_kernels_are_kept_elsewhere_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(cache, "kept", lambda module, name: False)
+    monkeypatch.setattr(cache, "writable", lambda: tmp_path)
+    monkeypatch.setattr(compiling, "_JOBS", {})
+    compiling.compile_kernels(say)
+    assert capsys.readouterr().err == ""  # nothing is missing
+    monkeypatch.setattr(compiling, "_JOBS", {"nothing": compiling._Job(lambda: None, ("tsdf", "_observe"))})
+    compiling.compile_kernels(say)
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == f"modeler: compiled kernels are kept in {tmp_path}, as {cache.folder()} cannot be written"

@@ -14,9 +14,10 @@ import numpy as np
 
 from modeler.baselines.clouds import AbstractCloudRegistrar, Cloud, Fit, cube_edges_m
 from modeler.baselines.icp import FINE, IcpRegistrar
+from modeler.system.extras import install_command
 from modeler.types import Array, InputError, RayImage
 
-MISSING = "KISS-Matcher is not installed; install it with: pip install -c constraints.txt -e '.[peers]'"
+MISSING = f"KISS-Matcher is not installed; install it with: {install_command('peers')}"
 
 
 def installed() -> bool:

@@ -16,6 +16,7 @@ from threading import Lock
 from typing import Any, TypeVar, final
 
 from modeler.system.concurrency import cores
+from modeler.system.extras import install_command
 from modeler.system.processes import environment
 from modeler.types import InputError
 
@@ -57,7 +58,7 @@ def check_engine(name: str) -> None:
         )
     package = {"dask": "distributed", "slurm": "submitit"}.get(kind)
     if package is not None and importlib.util.find_spec(package) is None:
-        raise InputError(f"`executor` {name}: {package} is not installed; pip install '.[{kind}]'")
+        raise InputError(f"`executor` {name}: {package} is not installed; {install_command(kind)}")
 
 
 def is_here(name: str) -> bool:

@@ -104,7 +104,7 @@ class LikelihoodBound:
 def failure(posterior: Posterior) -> Reason | None:
     """Return why a posterior cannot be a factor of a graph; None if it can."""
     if not posterior.usable:
-        return Failed(posterior.outcome)
+        return Failed(posterior.outcome, posterior.overlap)
     pose = posterior.pose
     if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
         return Degenerate(finite=False)

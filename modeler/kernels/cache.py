@@ -3,7 +3,8 @@
 Numba's own cache knows a kernel by its file, although functions of other files are inlined in it, reads whatever lies
 there, and ends the program where nothing can be written. Here a kernel is known by the contents of all sources, the
 processor and the versions that it was compiled by; each file holds a digest of the rest, and in doubt the kernel is
-compiled again. Where nothing can be written, kernels stay in memory.
+compiled again. Where neither the sources' folder nor the user's can be written, as on shared installations, kernels are
+kept in the folder of temporary files, and where nothing can be written in memory.
 """
 
 from __future__ import annotations
@@ -54,13 +55,14 @@ def folder() -> Path:
     return _folders()[0]
 
 
-def writable() -> bool:
-    """Return whether kernels can be kept."""
-    for probe in (folder / f"room-{os.getpid()}" for folder in _folders()):
+def writable() -> Path | None:
+    """Return the folder in which kernels will be kept; None if there is none."""
+    for folder in _folders():
+        probe = folder / f"room-{os.getpid()}"
         if _written(probe, bytes(_ALL_BYTES)):
             probe.unlink(missing_ok=True)
-            return True
-    return False
+            return folder
+    return None
 
 
 def kept(module: str, name: str) -> bool:
@@ -118,12 +120,26 @@ class KernelCache(_Cache):
 
 
 def _folders() -> list[Path]:
-    """Return where kernels are read and written, in this order: where Numba's setting says, the sources, the user."""
+    """Return where kernels are read and written, in this order.
+
+    Where Numba's setting says or the sources are, the user's folder for such files, and that of temporary files.
+    """
     user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     own = os.environ.get("NUMBA_CACHE_DIR")
     first = Path(own).absolute() if own else _HERE / "__pycache__"
     places = [first, Path(user) / "modeler"] if os.path.isabs(user) else [first]
+    temporary = Path(os.environ.get("TMPDIR") or "/tmp") / f"modeler-{os.geteuid()}"
+    places += [temporary] if temporary.is_absolute() and _is_private(temporary) else []
     return [place / f"kernels-{_MACHINE}-{_SOURCES}" for place in places]
+
+
+def _is_private(place: Path) -> bool:
+    """Return whether a folder, which anybody may make beforehand, is nobody else's."""
+    try:
+        status = place.lstat()
+    except OSError:  # it is not there yet
+        return True
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
 def _digest(*parts: object) -> str:
@@ -163,7 +179,8 @@ def _written(path: Path, data: bytes) -> bool:
     part = None
     try:
         if not path.parent.is_dir():
-            path.parent.mkdir(parents=True, exist_ok=True)
+            path.parent.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+            path.parent.mkdir(mode=0o755, exist_ok=True)
             for stale in _stale(path.parent):
                 shutil.rmtree(stale, ignore_errors=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:

@@ -224,7 +224,7 @@ class Joiner:
         """
         away_rad = float(se3.rotation_angle(se3.inverse(guess) @ posterior.pose.mean))
         if not posterior.usable:
-            return Edge(posterior, "join", False, Failed(posterior.outcome))
+            return Edge(posterior, "join", False, Failed(posterior.outcome, posterior.overlap))
         if away_rad > _MAX_DEVIATION_RAD:
             return Edge(posterior, "join", False, ElsewhereThanSegments(float(np.degrees(away_rad))))
         pair = self._pair(*views)
@@ -232,7 +232,7 @@ class Joiner:
         if sigma_rad > _OPEN_SHARE * _ALIGNMENT_SIGMA_RAD:
             return Edge(posterior, "join", False, OpenRotation(float(np.degrees(sigma_rad))))
         if not pair.fits(posterior.pose.mean, self._search.fine_m(pair)):  # method, eq. 6.5
-            return Edge(posterior, "join", False, Failed(Outcome.NO_OVERLAP))
+            return Edge(posterior, "join", False, Failed(Outcome.NO_OVERLAP, posterior.overlap))
         return Edge(posterior, "join", True, JoinsSegments(1.0, 0.0))
 
     def _nats(self, source: RayImage, target: RayImage, poses: Array) -> Array:
@@ -333,4 +333,8 @@ def _near(one: Alignment, other: Alignment) -> bool:
 
 def _rejected(edge: Edge) -> Edge:
     """Return an edge, rejected because the segments contradict each other."""
-    return replace(edge, accepted=False, reason=Failed(Outcome.NO_OVERLAP)) if edge.accepted else edge
+    return (
+        replace(edge, accepted=False, reason=Failed(Outcome.NO_OVERLAP, edge.posterior.overlap))
+        if edge.accepted
+        else edge
+    )

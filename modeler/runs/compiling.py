@@ -26,7 +26,7 @@ _USED = (
     "gauss_newton",
     "mixture",
 )
-_USED_TO_FUSE = ("tsdf", "marching_cubes", "point_clouds")
+_USED_TO_FUSE = ("tsdf", "relief", "marching_cubes", "point_clouds")
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
@@ -47,13 +47,18 @@ def compile_kernels(say: Callable[[str], None]) -> None:
     def note(module: str, often: str = "once on this machine") -> None:
         with lock:
             if module not in begun:
+                expected = "" if begun else ", half a minute on two idle cores"
                 begun.add(module)
-                say(f"compiling kernels, {often}: {len(begun)} of {total}")
+                say(f"compiling kernels, {often}: {len(begun)} of {total}{expected}")
 
-    if not cache.writable():
+    place = cache.writable()
+    if place is None:
         say(f"compiled kernels cannot be kept in {cache.folder()}; make room there, or set NUMBA_CACHE_DIR")
         kernels.on_compiling(lambda module: note(module, "for this command alone"))
         return
+
+    if place != cache.folder():
+        say(f"compiled kernels are kept in {place}, as {cache.folder()} cannot be written")
 
     def follow(process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None

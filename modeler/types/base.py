@@ -21,7 +21,10 @@ class Outcome(enum.Enum):
 
     CONVERGED = "converged", "The posterior has one narrow mode; nothing to do."
     AMBIGUOUS = "ambiguous", "Several poses explain the images; add a prior (table, turntable) or more views."
-    DEGENERATE = "degenerate", "Too few distinct samples carry the weight; raise the number of samples."
+    DEGENERATE = (
+        "degenerate",
+        "Too few distinct samples carry the weight; use a narrower prior, or views that share more surface.",
+    )
     NO_OVERLAP = "no overlap", "The views share too little surface; use a smaller step between frames."
     AT_LIMIT = (
         "at the prior's limit",

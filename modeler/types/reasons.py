@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 from modeler.types.base import Outcome
@@ -75,6 +75,8 @@ class Failed:
     """The attempt ended without a usable posterior or view."""
 
     outcome: Outcome
+    overlap: float | None = field(default=None, compare=False)
+    """That was measured; None: none was."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,7 @@ def explain(reason: Reason) -> str:
     """Return a reason in words, with advice."""
     match reason:
         case Failed(outcome):
-            return f"{outcome.label}: {outcome.advice}"
+            return f"{summary(reason)}: {outcome.advice}"
         case PriorRefused(message):
             return message
         case _:
@@ -217,6 +219,8 @@ def summary(reason: Reason) -> str:
             return f"{others}, but their alignment with the rest is undetermined"
         case ElsewhereThanSegments(angle_deg):
             return f"contradicts the alignment of the two segments by {angle_deg:.0f}°"
+        case Failed(Outcome.NO_OVERLAP, float(overlap)):
+            return f"too little surface matches, overlap {overlap:.2f}"
         case Failed(outcome):
             return outcome.label
         case PriorRefused(message):

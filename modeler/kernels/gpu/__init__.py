@@ -6,6 +6,8 @@ only for large batches.
 
 import ctypes
 import importlib.util
+import shlex
+import sys
 from functools import cache
 from typing import Any, Literal
 
@@ -31,7 +33,7 @@ def chosen(device: Device, lookups: int) -> str | None:
 def missing() -> str | None:
     """Return what is missing to evaluate on a CUDA device, and what to do; None if nothing is."""
     if importlib.util.find_spec("warp") is None:
-        return "warp-lang is not installed; pip install -c constraints.txt -e '.[gpu]'"
+        return f"warp-lang is not installed; {shlex.quote(sys.executable)} -m pip install 'modeler[gpu]'"
     without = "leave `device` out, or give `device` cpu"
     try:
         ctypes.CDLL("nvcuda.dll" if hasattr(ctypes, "WinDLL") else "libcuda.so.1")
