@@ -19,24 +19,28 @@ from typing import Final
 
 import numba
 
-from studies.multiplied.judged import judged, text
+from studies.multiplied.judged import counts, judged, text
 from studies.multiplied.study import AS_IT_IS, DATA, Run, captures, finished, half_of
 from studies.multiplied.ways import WAYS
+from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
 
-HALVES: Final = ("tuning", "held-out", "both")
+HALVES: Final = ("tuning", "held-out", "both", "none")
 
 
 def main() -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="python -m studies multiplied", description=__doc__)
-    parser.add_argument("--half", choices=HALVES, default="tuning", help="which pairs of capture and way")
+    parser.add_argument("--half", choices=HALVES, default="tuning", help="which pairs; none: captures as they are")
     parser.add_argument("--captures", nargs="+", metavar="NAME", help="only these")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of captures")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs side by side")
     parser.add_argument("--seed", type=int, default=0, help="of the registration")
     parser.add_argument("--out", type=Path, default=Path("runs/multiplied"), help="folder of the results")
+    parser.add_argument("--record", action="store_true", help="put the counts by capture into the results")
     options = parser.parse_args()
+    if options.record and (options.half != "held-out" or options.captures or options.seed):
+        parser.error("the results are of all captures of the held-out half with seed 0")
     options.out.mkdir(parents=True, exist_ok=True)
     names = [name for name in captures(options.data) if options.captures is None or name in options.captures]
     # References first: they are what the others are compared with.
@@ -67,7 +71,10 @@ def main() -> int:
                 flush=True,
             )
     pairs = [pair for pair in wanted if runs[pair].frames >= WAYS[pair[1]].least_frames]
-    print(text([judged(runs[pair], runs[pair[0], AS_IT_IS], options.data) for pair in pairs]))
+    found = [judged(runs[pair], runs[pair[0], AS_IT_IS], options.data) for pair in pairs]
+    print(text(found))
+    if options.record:
+        record(FOLDER / "multiplied.json", counts(found, [one.run.capture for one in found]))
     return 0
 
 

@@ -80,25 +80,24 @@ def text(all_judged: Sequence[Judged]) -> str:
 
 
 def table(all_judged: Sequence[Judged], title: str, keys: Sequence[str]) -> str:
-    """Return runs, frames placed, and rightness by status, a row a key."""
+    """Return a table of `counts`, a row a key."""
+    columns = [f"{right}, {status}" for right in ("right", "wrong", "no reference") for status in ("0", "3")]
+    return markdown((title, "runs", "placed", *columns), counts(all_judged, keys))
+
+
+def counts(all_judged: Sequence[Judged], keys: Sequence[str]) -> list[tuple[str | int, ...]]:
+    """Return the number of runs, the share of frames placed, and runs by rightness and status: a row a key, and all."""
     rows = []
     for key in [*dict.fromkeys(keys), None]:
         part = [one for one, own in zip(all_judged, keys, strict=True) if key in (None, own)]
         placed = sum(len(one.run.poses) for one in part) / max(1, sum(one.run.frames for one in part))
-        counts = [
+        kinds = [
             sum(one.right is right and (one.run.status == 0) is trusted for one in part)
-            for right, trusted in (
-                (True, True),
-                (True, False),
-                (False, True),
-                (False, False),
-                (None, True),
-                (None, False),
-            )
+            for right in (True, False, None)
+            for trusted in (True, False)
         ]
-        rows.append((key or "all", len(part), f"{100.0 * placed:.0f} %", *counts))
-    columns = [f"{right}, {status}" for right in ("right", "wrong", "no reference") for status in ("0", "3")]
-    return markdown((title, "runs", "placed", *columns), rows)
+        rows.append((key or "all", len(part), f"{100.0 * placed:.0f} %", *kinds))
+    return rows
 
 
 def _truth(capture: str, data: Path) -> dict[str, Array]:

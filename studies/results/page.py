@@ -43,8 +43,8 @@ def _captures(tables: Mapping[str, Table]) -> str:
     build = next(row for row in tables["speed_builds"].rows if str(row[0]).startswith("cap,"))
     _, count, size, _ = str(build[0]).split(", ")
     return (
-        f"**On {_NUMBERS[len(frames)]} real captures** (Kinect 1, D415, D435, laser; {min(n for _, n in frames)} to"
-        f" {max(n for _, n in frames)} frames) {share} frames are placed,"
+        f"**On {_NUMBERS[len(frames)]} real captures** (Kinect 1 and 2, Xtion, D415, D435, laser;"
+        f" {min(n for _, n in frames)} to {max(n for _, n in frames)} frames) {share} frames are placed,"
         f" largest rotation errors are {min(errors, key=float)}° to {max(errors, key=float)}° where truth is known,"
         f" {_NUMBERS[trusted]} models can be trusted, and {count} of {size} take {float(build[1]):.0f} s on two cores."
     )
