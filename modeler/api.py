@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
@@ -36,6 +37,7 @@ from modeler.types import (
     Step,
     Verdict,
 )
+from modeler.verdict.advice import remedies
 from modeler.views import Sensor
 from modeler.viz.stream import open_stream
 
@@ -179,6 +181,7 @@ def build(
         seed=seed,
         prior=compose.resolved_prior(options, frames)[0],
         settings={name: value for name, value in settings.items() if value not in (None, ())},
+        advice=partial(_advice, modeler.prior),
     )
     closure_expected = comes_back(frames, modeler.prior, modeler.closer.max_angle_deg)
     scene = compose.scene(modeler, frames)
@@ -194,6 +197,14 @@ def build(
         raise InputError(f"{frames.name}: has no selected frame; select others")
     report = report_of(last, meta) if folder is None else RunFolder(folder).report()
     return Result(last.model, PoseGraph(last.edges_so_far), last.solution, last.verdict, report, folder)
+
+
+def _advice(prior: AbstractPrior, report: Mapping[str, Any]) -> list[str]:
+    """Return in words what to do about a model that cannot be trusted."""
+    return [
+        f"{each.words}: {', '.join(f'{name} {value}' for name, value in each.parameters.items()) or each.first}"
+        for each in remedies(report, prior)
+    ]
 
 
 def _opened(sequence: str | Path | Iterable[Frame], *, live: bool) -> AbstractSequence:

@@ -81,6 +81,10 @@ def test_the_report_draws_the_model_and_turns_it(run: Path, page: chromium.Page)
     page.value("chosen.dispatchEvent(new Event('change'))")
     plain = page.picture()[inside].astype(int)
     assert np.mean(np.abs(plain - alone).max(axis=2) > 5) > 0.01
+    page.value("document.querySelector('.mask button').click()")
+    assert page.value("document.querySelector('#large[open] img').getBoundingClientRect().width") > 700.0
+    page.value("document.getElementById('large').click()")
+    assert not page.value("document.getElementById('large').open")
     broken = page.value("[...document.images].filter((image) => !image.naturalWidth).length")
     assert broken == 0
     assert page.value("document.images.length") > 5

@@ -187,6 +187,33 @@ def test_the_worst_pairs_come_first(run: Path, tmp_path: Path) -> None:
     assert sds[0] > 3.0
 
 
+@pytest.mark.usefixtures("_undrawn")
+def test_surface_that_others_contradict_is_coloured_in_its_frame_and_the_remedy_told(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "wrong")
+    report = json.loads((run / "report.json").read_text())
+    rows = recorded(run / "recording.rrd")
+    (blob,) = rows[entities.MASK][1]["blob"]
+    mask = np.asarray(
+        Image.open(io.BytesIO(bytes(blob.as_py()[0] if isinstance(blob.as_py()[0], list) else blob.as_py())))
+    )
+    row, column = np.argwhere(mask).mean(axis=0).astype(int).tolist()
+    surface = [number for k in range(-4, 5) for number in (row + k, column, 3, 1)]
+    report["contradicted"] = {"1": {"size": mask.shape, "surface": surface, "free": []}}
+    report |= {"trustworthy": False, "reasons": ["a < b"], "remedies": ["do this: modeler build 'a b'"]}
+    (tmp_path / "wrong" / "report.json").write_text(json.dumps(report))
+    write_page(tmp_path / "wrong", tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert escape("do this: modeler build 'a b'") in page.partition("<h2>")[0]
+    masks = page.partition("<h2>Masks</h2>")[2].partition("<h2>")[0]
+    assert "1, contradicted" in re.findall(r"<p>([^<]*)</p>", masks)
+    pictures = [base64.b64decode(found) for found in re.findall(r"base64,([^']*)'", masks)]
+    red = []
+    for picture in pictures[:3]:
+        shown = np.asarray(Image.open(io.BytesIO(picture)), dtype=float)
+        red.append((shown[..., 0] > shown[..., 1:].max(axis=2) + 60.0).mean())
+    assert red[1] > 10.0 * max(red[0], red[2], 1e-5)
+
+
 def test_the_mask_of_every_frame_is_shown(run: Path, page: str) -> None:
     masks = page.partition("<h2>Masks</h2>")[2].partition("<h2>")[0]
     assert re.findall(r"<p>([^<]*)</p>", masks) == [f"{k}, left out" if k == LOST else str(k) for k in range(COUNT)]

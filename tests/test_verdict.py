@@ -120,6 +120,13 @@ def test_other_frames_see_through_what_is_in_the_wrong_place() -> None:
     assert wrong is not None
     assert wrong.frame == 5
     assert not wrong.violations.holds
+    assert 5 in wrong.contradictions
+    found = wrong.contradictions[5]
+    mask = views[5].frame.mask
+    assert mask is not None
+    assert mask[tuple(found.surface[:, :2].T.astype(int))].all()
+    assert (found.surface[:, 2] >= 1).all()
+    assert len(found.free) == len(np.unique(found.free, axis=0)) > 0
     assert free_space({0: views[0]}, poses_of([0.0]), 0.005) is None  # nobody else looks
 
 
@@ -132,6 +139,12 @@ def test_a_part_that_one_frame_alone_shows_is_not_there() -> None:
     assert found is not None
     assert found.contradicted_frame == 2
     assert not found.false_surface.holds
+    assert set(found.contradictions) == {2}
+    false = found.contradictions[2].surface[found.contradictions[2].surface[:, 2] >= 2]
+    columns = np.flatnonzero(views[2].frame.mask.any(axis=0))  # pyright: ignore[reportOptionalMemberAccess]
+    rows = np.flatnonzero(views[2].frame.mask.any(axis=1))  # pyright: ignore[reportOptionalMemberAccess]
+    outside = ~np.isin(false[:, 0], rows) | ~np.isin(false[:, 1], columns)
+    assert outside.mean() > 0.5  # beyond the outline that the object has in truth
     assert free_space(views, poses, 0.005).false_surface.holds  # pyright: ignore[reportOptionalMemberAccess]
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from modeler.cli.console import Console, Interrupt, say
+from modeler.cli.console import Console, Interrupt, as_options, say
 from modeler.cli.options import MIN_VOXEL_M, FrameOptions, InputOptions, ModelOptions
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
@@ -93,6 +93,7 @@ class Build:
             settings=self.settings(),
             camera=estimated_camera(self.model.camera),
             digests=digests,
+            advice=partial(self.advice, modeler.prior),
         )
         if self.resume and RunFolder(self.out).finished(meta):
             RunFolder(self.out).pairs.drop()  # left over from a kill at the very end
@@ -127,6 +128,22 @@ class Build:
         return {
             name: value for name, value in parts.items() if name not in ("prior", "seed") and value not in (None, ())
         }
+
+    def advice(self, prior: AbstractPrior, report: Mapping[str, Any]) -> list[str]:
+        """Return in words, with commands, what to do about a model that cannot be trusted.
+
+        Args:
+            prior: of the run.
+            report: of the run.
+        """
+        from modeler.verdict.advice import remedies
+
+        found = []
+        for remedy in remedies(report, prior):
+            commands = [remedy.first.format(run=shlex.quote(str(self.out)))] if remedy.first else []
+            commands += [self.command(remedy.parameters)] if remedy.parameters else []
+            found.append(as_options(f"{remedy.words}: {' && '.join(commands)}"))
+        return found
 
     def command(self, changes: Mapping[str, str]) -> str:
         """Return the command line that replaces the run by one with other parameters."""
@@ -242,7 +259,9 @@ def _run(
     try:
         with (
             # A live run does not wait for the drawing; the last step draws all poses and the model.
-            in_background(stream, lambda step: frames.live and not step.last, share=DRAWING_SHARE) as draw,
+            in_background(
+                stream, lambda event: frames.live and not (isinstance(event, Step) and event.last), share=DRAWING_SHARE
+            ) as draw,
             Interrupt() as interrupt,
             Console(len(frames), stream.address, modeler.prior) as console,
             advising(run.modeler, console.advise, stream.advise) as advise,
@@ -297,7 +316,6 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
     from modeler.verdict.advice import (
         estimated_focal_length,
         measured_step,
-        remedies,
         sign_in_doubt,
         unchecked_focal_length,
         visible_frames,
@@ -335,8 +353,6 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
     ):
         if remark:
             say(remark)
-    for next_step in [] if report["trustworthy"] else remedies(report, prior):
-        commands = [next_step.first.format(run=shlex.quote(str(options.out)))] if next_step.first else []
-        commands += [options.command(next_step.parameters)] if next_step.parameters else []
-        say(f"{next_step.words}: {' && '.join(commands)}")
+    for words in report.get("remedies", ()):
+        say(words)
     return 0 if report["trustworthy"] else 3

@@ -64,14 +64,16 @@ class Report:
         inputs = run_inputs([self.run_folder], self.moved.sequence)
         check_files([out], inputs[1:] if self.out is None else inputs, overwrite=self.overwrite)
         RunFolder(self.run_folder).result()  # refuses folders without a finished run
+        truth, omitted = None, ""
         try:
             truth = _truth(self.run_folder, self.moved.sequence)
         except InputError as error:
             if self.moved.sequence:
                 raise
-            say(f"errors against the truth are left out: {error}")
-            truth = None
+            omitted = f"errors against the truth are left out: {error}"
         write_page(self.run_folder, out, truth)
+        if omitted:
+            say(omitted)
         say(f"open {out} in a browser")
         return 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -48,6 +48,12 @@ def _versions() -> dict[str, str]:
     return found
 
 
+def _no_advice(report: Mapping[str, Any]) -> Sequence[str]:
+    """Return no advice."""
+    del report
+    return ()
+
+
 @dataclass(frozen=True)
 class RunMeta:
     """Contents of a report besides the results."""
@@ -69,6 +75,8 @@ class RunMeta:
     """Of the images and the camera of each frame, by its number; empty where they are not known beforehand."""
     versions: Mapping[str, str] = field(default_factory=_versions)
     """Version by package."""
+    advice: Callable[[Mapping[str, Any]], Sequence[str]] = _no_advice
+    """From a report to what to do about a model that cannot be trusted, in words."""
 
 
 def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
@@ -110,6 +118,14 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
             }
             for name, check in verdict.checks.items()
         },
+        "contradicted": {
+            str(frame): {
+                "size": views[frame].frame.depth_m.shape,
+                "surface": found.surface.astype(int),
+                "free": found.free.astype(int),
+            }
+            for frame, found in verdict.contradicted.items()
+        },
         "up": None if support is None else support.normal,
         "support_offset_m": None if support is None else support.offset_m,
         "frames": [vars(frame) for frame in step.frames_so_far],
@@ -119,7 +135,8 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         for frame, pose in sorted(solution.trajectory.items())
     ]
     edges = [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far]
-    return {**_json(report), "edges": edges, "poses": _json(poses)}
+    report = {**_json(report), "edges": edges, "poses": _json(poses)}
+    return {**report, "remedies": list(meta.advice(report)) if step.last and not verdict.trustworthy else []}
 
 
 def _camera(

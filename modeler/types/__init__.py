@@ -62,6 +62,7 @@ from modeler.types.solution import loop_closure_errors as loop_closure_errors
 from modeler.types.solution import loops_closed as loops_closed
 from modeler.types.solution import segments as segments
 from modeler.types.verdict import Check as Check
+from modeler.types.verdict import Contradictions as Contradictions
 from modeler.types.verdict import FrameRecord as FrameRecord
 from modeler.types.verdict import Shortcoming as Shortcoming
 from modeler.types.verdict import Verdict as Verdict

@@ -332,7 +332,7 @@ def loop_closure_errors(
         return []
     motions, counts = chains.motions([(edge.target, edge.source) for edge in loops])
     return [
-        _opening(edge, solution.pose_of(edge), motion, int(count), centroids_m.get(edge.source, np.zeros(3)))
+        _closure_error(edge, solution.pose_of(edge), motion, int(count), centroids_m.get(edge.source, np.zeros(3)))
         for edge, motion, count in zip(loops, motions, counts, strict=True)
     ]
 
@@ -345,7 +345,9 @@ def loop_closure_error(
     return max(errors, key=lambda error: (error.edges, error.sigmas), default=None)
 
 
-def _opening(edge: Edge, closure: PoseGaussian, chain: PoseGaussian, count: int, centroid_m: Array) -> LoopClosureError:
+def _closure_error(
+    edge: Edge, closure: PoseGaussian, chain: PoseGaussian, count: int, centroid_m: Array
+) -> LoopClosureError:
     """Return the error between a closure and the chain of its frames."""
     xi = se3.log(se3.inverse(closure.mean) @ chain.mean)
     squared = xi @ np.linalg.solve(closure.covariance + chain.covariance, xi)

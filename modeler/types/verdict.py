@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from modeler.types.base import Outcome
+from modeler.types.base import Array, Outcome
 from modeler.types.reasons import ACCEPTED
 
 
@@ -62,6 +62,17 @@ class Shortcoming:
     """For people."""
 
 
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """Where a frame and others contradict each other under the poses found, in pixels of the frame."""
+
+    surface: Array
+    """(n, 4) row and column of its surface in the free space of others, number of frames in whose free space it is, and
+    of frames that see it."""
+    free: Array
+    """(m, 2) row and column where it measured free space, and others surface."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether a model can be trusted."""
@@ -74,6 +85,8 @@ class Verdict:
     available."""
     tolerance_m: float = 0.0
     """Error of the surface above which a model is called wrong."""
+    contradicted: Mapping[int, Contradictions] = field(default_factory=dict)
+    """By number of a frame that contradicts others beyond a limit."""
 
     @property
     def trustworthy(self) -> bool:

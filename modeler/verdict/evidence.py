@@ -17,6 +17,7 @@ from modeler.types import (
     Array,
     BoolArray,
     Check,
+    Contradictions,
     Edge,
     InputError,
     JoinsSegments,
@@ -248,6 +249,8 @@ class FreeSpace:
     """Number of the frame with the largest share of contradicted surface."""
     false_surface: Check
     """That share: points in the free space of two frames or more, and of most of those that observe them."""
+    contradictions: Mapping[int, Contradictions]
+    """By number of a frame beyond a limit."""
 
 
 def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], tolerance_m: float) -> FreeSpace | None:
@@ -266,8 +269,10 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
     frames = [frames[k] for k in chosen]
     reaches_m = {frame: _nearest_around(views[frame]) for frame in frames}
     looks, absent = np.zeros((len(frames), 2)), np.zeros((len(frames), 2))
+    surface: list[Array] = []  # by frame: of it in the free space of others, and of others in its free space
+    free: list[list[Array]] = [[] for _ in frames]
     for row, frame in enumerate(frames):
-        points_m, normals = _facing(views[frame])
+        points_m, normals, places = _facing(views[frame])
         tally = np.zeros((2, len(points_m)))  # per point: frames with it in free space, frames that see it
         for column, other in enumerate(frames):
             if other != frame:
@@ -276,9 +281,11 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
                 beyond_m = _beyond(views[other], reaches_m[other], carried_m, turned)
                 found = np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
                 tally += found
+                free[column].append(_pixels(views[other], carried_m[found[0]]))
                 looks[[row, column]] += found.sum(axis=1)  # which of the two is wrong is unknown
         through, judged = tally[0], tally.sum(axis=0) >= 2
         absent[row] = np.sum(judged & (through >= 2) & (through > tally[1])), judged.sum()
+        surface.append(np.column_stack([places, tally.T])[through > 0])
     known = looks.sum(axis=1) >= _MIN_POINTS
     if not known.any():
         return None
@@ -290,19 +297,22 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
         Check(float(shares[worst]), MAX_VIOLATIONS),
         frames[barest],
         Check(float(bare[barest]), MAX_FALSE_SURFACE),
+        {
+            frame: Contradictions(surface[row], np.unique(np.concatenate(free[row]), axis=0))
+            for row, frame in enumerate(frames)
+            if shares[row] > MAX_VIOLATIONS or bare[row] > MAX_FALSE_SURFACE
+        },
     )
 
 
-def _facing(view: RayImage) -> tuple[Array, Array]:
-    """Return surface points (n, 3) of a view that face its camera, away from its outline, and their normals (n, 3)."""
+def _facing(view: RayImage) -> tuple[Array, Array, np.ndarray]:
+    """Return surface points (n, 3) of a view that face its camera, away from its outline, normals (n, 3) and pixels."""
     mask = view.frame.mask
     assert mask is not None  # a view's frame is segmented
     inner = ndimage.minimum_filter(mask, size=2 * _MARGIN_PX + 1, mode="nearest")[view.pixels[:, 0], view.pixels[:, 1]]
-    points_m, normals = view.points_m[inner], view.normals[inner]
-    some = slice(None, None, max(len(points_m) // MAX_POINTS, 1))
-    points_m, normals = points_m[some], normals[some]
-    faces = _face_camera(points_m, normals)
-    return points_m[faces], normals[faces]
+    some = np.flatnonzero(inner)[:: max(np.count_nonzero(inner) // MAX_POINTS, 1)]
+    some = some[_face_camera(view.points_m[some], view.normals[some])]
+    return view.points_m[some], view.normals[some], view.pixels[some]
 
 
 def _face_camera(points_m: Array, normals: Array) -> BoolArray:
@@ -318,6 +328,12 @@ def _nearest_around(view: RayImage) -> Array:
     return np.where(measured, near_m, np.nan)
 
 
+def _pixels(view: RayImage, points_m: Array) -> Array:
+    """Return row and column (n, 2), whole numbers, at which points (n, 3) in front of a view's camera appear in it."""
+    camera, (x, y, z) = view.frame.camera, points_m.T
+    return np.rint(np.column_stack([camera.fy * y / z + camera.cy, camera.fx * x / z + camera.cx]))
+
+
 def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
     """Return the distances (n,) in m that a view measured beyond points; NaN for those that do not face its camera.
 
@@ -327,10 +343,9 @@ def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> A
         points_m: (n, 3) in its camera's coordinates.
         normals: (n, 3) unit.
     """
-    camera, depth_m = view.frame.camera, points_m[:, 2]
+    depth_m = points_m[:, 2]
     ahead = np.flatnonzero(_face_camera(points_m, normals) & (depth_m > 0.0))
-    columns = np.rint(camera.fx * points_m[ahead, 0] / depth_m[ahead] + camera.cx)
-    rows = np.rint(camera.fy * points_m[ahead, 1] / depth_m[ahead] + camera.cy)
+    rows, columns = _pixels(view, points_m[ahead]).T
     height, width = near_m.shape
     inside = (columns >= _MARGIN_PX) & (columns < width - _MARGIN_PX)
     inside &= (rows >= _MARGIN_PX) & (rows < height - _MARGIN_PX)

@@ -35,6 +35,7 @@ from modeler.types import (
 )
 from modeler.verdict.evidence import (
     MAX_UNSURE,
+    FreeSpace,
     contradiction,
     default_tolerance_m,
     displacement,
@@ -86,7 +87,8 @@ def judged(
         reasons.append(Shortcoming("too_few_frames", words))
     edges = [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
     reasons += [Shortcoming("left_out", words) for words in _left_out(frames, segments(edges))]
-    found = _found(step, frames, edges, prior, tolerance_m) if step.last else []
+    free = free_space(step.views, step.solution.trajectory, tolerance_m) if step.last else None
+    found = _found(step, frames, edges, prior, tolerance_m, free=free) if step.last else []
     reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _unconfirmed_join(edges)
@@ -94,7 +96,8 @@ def judged(
     if step.last:
         spreads = [*_spreads(step, edges, tolerance_m), *_size(step, depth_scale_sigma, tolerance_m)]
     reasons += _against(spreads)
-    return Verdict(tuple(reasons), {finding.name: finding.check for finding in (*found, *spreads)}, tolerance_m)
+    checks = {finding.name: finding.check for finding in (*found, *spreads)}
+    return Verdict(tuple(reasons), checks, tolerance_m, {} if free is None else free.contradictions)
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,8 @@ def _found(
     edges: Sequence[Edge],
     prior: AbstractPrior | None,
     tolerance_m: float,
+    *,
+    free: FreeSpace | None,
 ) -> list[_Finding]:
     """Return the evidence of a whole run.
 
@@ -129,6 +134,7 @@ def _found(
         edges: those that take part.
         prior: of the motions.
         tolerance_m: error of the surface above which a model is wrong.
+        free: the free-space violations, if they can be evaluated.
     """
     views, solution, found = step.views, step.solution, []
     accepted = [frame for frame in frames if frame.accepted]
@@ -167,7 +173,7 @@ def _found(
             f"expected from their covariances (up to {fit.limit:.1f} by chance)"
         )
         found.append(_Finding("graph_chi2", fit, "edges_disagree", words))
-    if (free := free_space(views, solution.trajectory, tolerance_m)) is not None:
+    if free is not None:
         words = (
             f"{100.0 * free.violations.value:.0f} % of the surface of frame {free.frame} violates the free space of "
             f"other frames by more than {1000.0 * tolerance_m:.1f} mm: {_NO_SURFACE}"

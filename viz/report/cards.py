@@ -14,9 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from modeler import evaluation, se3
 from modeler.types import ACCEPTED, Array, Edge, Outcome, explain
+from modeler.verdict.evidence import MAX_POINTS
 from modeler.viz import entities
 from modeler.viz.blueprint import FROM_THE_SIDE
 from modeler.viz.reader import FRAME_PATHS
@@ -76,22 +78,37 @@ def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[s
         result: the run.
         pictures: by frame number.
     """
-    cards = []
+    cards, contradicted = [], result.report.get("contradicted") or {}
     for frame in result.report["frames"]:
         shown = pictures.get(frame["id"])
-        if shown is not None and shown.outlined is not None:
+        if shown is not None and shown.masked is not None:
             unsure = frame.get("mask") == Outcome.UNSURE_MASK.label
             words = [str(frame["id"]), *(["unsure"] if unsure else [])]
             words += [] if frame["outcome"] == ACCEPTED else ["left out"]
+            words += ["contradicted"] if str(frame["id"]) in contradicted else []
             cards.append(
-                f"<div class='mask{' no' if len(words) > 1 else ''}'><img src='{data_address(shown.outlined, 'jpeg')}' "
-                f"alt=''><p>{', '.join(words)}</p></div>"
+                f"<div class='mask{' no' if len(words) > 1 else ''}'><button type='button'>"
+                f"<img src='{data_address(shown.masked, 'jpeg')}' alt='frame {frame['id']}'></button>"
+                f"<p>{', '.join(words)}</p></div>"
             )
     note = (
-        "The segmented object in each frame. The outline should follow the object all around: anything else inside "
-        "becomes part of the model, anything outside is missing. Unsure: the object could not be segmented reliably."
+        "The segmented object in each frame; a click enlarges it. The outline should follow the object all around: "
+        "anything else inside becomes part of the model, anything outside is missing. Unsure: the object could not be "
+        "segmented reliably."
     )
-    return [f"<h2>Masks</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"] if cards else []
+    if contradicted:
+        note += (
+            " Contradicted, under the poses found: <b class='no'>red</b>, surface through which most frames see that "
+            "observe it; <span class='orange'>orange</span>, through which some see; <span class='teal'>teal</span>, "
+            "where this frame sees through the surface of others. At outlines, masks include more than the object; all "
+            "over, a pose is wrong."
+        )
+    if not cards:
+        return []
+    return [
+        f"<h2>Masks</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"
+        f"<dialog id='large'></dialog><script>{_ENLARGE}</script>"
+    ]
 
 
 def _apart_sds(result: Result, edge: Edge) -> float | None:
@@ -160,7 +177,18 @@ def _pair_card(
     )
 
 
+_ENLARGE: Final = """
+const large = document.getElementById('large');
+for (const button of document.querySelectorAll('.mask button'))
+  button.onclick = () => { large.replaceChildren(button.firstChild.cloneNode()); large.showModal(); };
+large.onclick = () => large.close();
+"""
 _SIZE: Final = (150, 200)  # height and width in px
+_MASK_SIZE: Final = (360, 480)
+_MANY: Final = 100  # frames, beyond which those are large alone of which something is doubtful
+_MARKS_RGB: Final = ((31, 143, 155), (217, 115, 13), (200, 69, 63))
+"""Of free space with surface of others, of surface in the free space of others, and of false surface."""
+_COVER: Final = 0.75  # of a mark over the picture
 _JPEG_QUALITY: Final = 82
 _BACKGROUND: Final = 250
 _ROOM: Final = 0.3  # around the object, as a share of its size
@@ -177,25 +205,56 @@ class Thumbnails:
     """The frame's surface and that of the view it was registered to, both in their own camera's coordinates."""
     after: bytes | None
     """The same under the mean of the posterior."""
+    masked: bytes | None
+    """As `outlined`, larger, with the surface marked that other frames contradict."""
 
 
-def thumbnails(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Thumbnails]:
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """Where a frame and others contradict each other, as in report.json."""
+
+    size: tuple[int, int]
+    """Height and width of the frame in px."""
+    places: tuple[Array, Array, Array]
+    """(n, 2) row and column, by colour of `_MARKS_RGB`."""
+
+    @classmethod
+    def read(cls, found: Mapping[str, Any]) -> Marks:
+        """Return the marks of a record of report.json."""
+        surface, free = np.reshape(found["surface"], (-1, 4)), np.reshape(found["free"], (-1, 2))
+        false = (surface[:, 2] >= 2) & (surface[:, 2] > surface[:, 3])
+        return cls(tuple(found["size"]), (free, surface[~false, :2], surface[false, :2]))
+
+
+def thumbnails(rows: Mapping[str, Mapping[int, Row]], report: Mapping[str, Any]) -> dict[int, Thumbnails]:
     """Return the pictures by frame number.
 
     Args:
         rows: of the recording, as `recorded` returns them.
+        report: `report.json`.
     """
     frames = sorted({frame for entity in rows.values() for frame in entity})
-    return {frame: _of_frame({path: rows[path].get(frame, {}) for path in FRAME_PATHS}) for frame in frames}
+    marks = {int(frame): Marks.read(found) for frame, found in (report.get("contradicted") or {}).items()}
+    doubtful = {record["id"] for record in report["frames"] if record.get("mask") == Outcome.UNSURE_MASK.label}
+    doubtful |= {record["id"] for record in report["frames"] if record["outcome"] != ACCEPTED} | set(marks)
+    return {
+        frame: _of_frame(
+            {path: rows[path].get(frame, {}) for path in FRAME_PATHS},
+            _MASK_SIZE if frame in doubtful or len(frames) <= _MANY else _SIZE,
+            marks.get(frame),
+        )
+        for frame in frames
+    }
 
 
-def _of_frame(rows: Mapping[str, Row]) -> Thumbnails:
+def _of_frame(rows: Mapping[str, Row], mask_size: tuple[int, int], marks: Marks | None) -> Thumbnails:
     seen, depth, mask = (_picture(rows[path]) for path in (entities.COLOUR, entities.DEPTH, entities.MASK))
-    outlined = _outlined(depth if seen is None else seen, mask)
+    shown = depth if seen is None else seen
+    outlined, masked = _outlined(shown, mask, _SIZE), _outlined(shown, mask, mask_size, marks)
     target, before, after = (cloud(rows[p]) for p in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER))
     if target is None or before is None or after is None:
-        return Thumbnails(outlined, None, None)
-    return Thumbnails(outlined, _pair_picture(target, before), _pair_picture(target, after))
+        return Thumbnails(outlined, None, None, masked)
+    return Thumbnails(outlined, _pair_picture(target, before), _pair_picture(target, after), masked)
 
 
 def _picture(row: Row) -> Image.Image | None:
@@ -204,21 +263,53 @@ def _picture(row: Row) -> Image.Image | None:
     return None if blob is None else Image.open(io.BytesIO(bytes(blob.values[0].values.to_numpy())))
 
 
-def _outlined(picture: Image.Image | None, mask: Image.Image | None) -> bytes | None:
-    """Return the part of a picture (colour or depth) around the object, small and outlined; None without a picture."""
+def _outlined(
+    picture: Image.Image | None, mask: Image.Image | None, size: tuple[int, int], marks: Marks | None = None
+) -> bytes | None:
+    """Return the part of a picture (colour or depth) around the object, outlined; None without a picture.
+
+    Args:
+        picture: of the frame.
+        mask: of the object.
+        size: height and width in px; the height follows the part.
+        marks: surface to mark.
+    """
     if picture is None:
         return None
     mask = Image.new("L", picture.size, 255) if mask is None else mask.convert("L").resize(picture.size)
     box = _around(np.asarray(mask) > 0)
-    shape = (_SIZE[1], round(_SIZE[1] * (box[3] - box[1]) / (box[2] - box[0])))
+    shape = (size[1], round(size[1] * (box[3] - box[1]) / (box[2] - box[0])))
     on = np.asarray(mask.crop(box).resize(shape, Image.Resampling.NEAREST)) > 0
     how = Image.Resampling.BICUBIC if picture.mode == "RGB" else Image.Resampling.NEAREST
     pixels = np.array(picture.crop(box).resize(shape, how), dtype=np.float64)
     if pixels.ndim == 2:
         pixels = _grey(pixels, on)
+    if marks is not None:
+        _mark(pixels, marks, np.array(box) / picture.width * marks.size[1], int(np.count_nonzero(on)))
     line = ndimage.binary_dilation(on) != ndimage.binary_erosion(on, border_value=1)
     pixels[line] = entities.OUTLINE_RGB
     return _jpeg(Image.fromarray(pixels.astype(np.uint8)))
+
+
+def _mark(pixels: Array, marks: Marks, box: Array, area: int) -> None:
+    """Paint surface that other frames contradict into a picture.
+
+    Args:
+        pixels: (h, w, 3) of the picture, changed in place.
+        marks: the surface.
+        box: left, top, right and bottom of the picture, in px of the frame.
+        area: of the object in the picture, in px.
+    """
+    height, width = pixels.shape[:2]
+    scale = width / (box[2] - box[0])
+    reach = max(1.0, 0.5 * np.sqrt(area / MAX_POINTS))  # so that neighbouring points touch
+    rows, columns = np.mgrid[:height, :width]
+    for rgb, places in zip(_MARKS_RGB, marks.places, strict=True):
+        centres = (places[:, ::-1] - box[:2]) * scale
+        if len(centres):
+            near_px = KDTree(centres).query(np.column_stack([columns.ravel(), rows.ravel()]))[0]
+            covered = near_px.reshape(height, width) <= reach
+            pixels[covered] = (1.0 - _COVER) * pixels[covered] + _COVER * np.array(rgb)
 
 
 def _around(on: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:

@@ -17,7 +17,7 @@ _SHOWN: Final = {
     "name": ("name", 1.0, ""),
     "frames": ("frames", 1.0, ""),
     "accepted": ("frames placed", 1.0, ""),
-    "opening_deg": ("loop opening", 1.0, "°"),
+    "opening_deg": ("loop closure error", 1.0, "°"),
     "opening_sigmas": ("loop closure error, in sd", 1.0, " sd"),
     "rotation_error_deg": ("largest rotation error", 1.0, "°"),
     "translation_error_m": ("largest translation error", 1000.0, " mm"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -52,7 +52,8 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     rows = recorded(run / "recording.rrd")
     parts = [_head(result, mesh), *_model(result, mesh), evidence_table(result.report.get("evidence") or {})]
     parts += [*symmetry_section(run / "model.ply", result.report), *_trajectory(result, mesh, centre_m)]
-    parts += [*_closure(result, rows), *_accuracy(result, centre_m), *mask_cards(result, pictures := thumbnails(rows))]
+    pictures = thumbnails(rows, result.report)
+    parts += [*_closure(result, rows), *_accuracy(result, centre_m), *mask_cards(result, pictures)]
     parts += pair_cards(result, pictures, centre_m)
     parts.append(_settings(result))
     page = Template(_asset("page.html")).substitute(
@@ -61,7 +62,7 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     write_atomically(out, page)
 
 
-def _opening(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
+def _loop_closure_error(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
     """Return the loop closure error as a key value; nothing without a closed loop."""
     if loop is None:
         return []
@@ -90,10 +91,11 @@ def _head(result: Result, mesh: Mesh | None) -> str:
     """Return name, verdict and key figures."""
     report = result.report
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in report["reasons"])
+    remedies = "".join(f"<p>What to do: {escape(words)}</p>" for words in report.get("remedies", ()))
     verdict = (
         '<p class="verdict">All frames were placed and all checks passed.</p>'
         if report["trustworthy"]
-        else f'<div class="verdict no">Do not trust this model:<ul>{reasons}</ul></div>'
+        else f'<div class="verdict no">Do not trust this model:<ul>{reasons}</ul>{remedies}</div>'
     )
     closed = loops_closed([edge for edge in result.edges if edge.accepted])
     total_s = report["seconds"].get("total")
@@ -104,7 +106,7 @@ def _head(result: Result, mesh: Mesh | None) -> str:
             "loop closed" if closed == 1 else "loops closed",
             "a view was registered to one that the object had turned away from",
         ),
-        *_opening(report.get("loop")),
+        *_loop_closure_error(report.get("loop")),
         *_focal_length(report.get("camera")),
         ("none" if mesh is None else f"{mesh.total:,}", "triangles", "of the fused mesh"),
         ("unknown" if total_s is None else f"{total_s:.0f} s", "build time", "reading and writing included"),
@@ -112,9 +114,15 @@ def _head(result: Result, mesh: Mesh | None) -> str:
     if result.true_pose(result.first) is not None:
         poses = {k: pose.mean for k, pose in result.poses.items() if result.true_pose(k) is not None}
         off = evaluation.trajectory_errors(poses, result.truth, np.zeros(3))
-        figures.append(
-            (f"{off.max_rotation_deg:.2f}°", "largest rotation error", "of a pose relative to the first, against truth")
+        aligned = evaluation.align_to_model(poses, result.truth)
+        least_deg = max(
+            evaluation.rotation_error_deg(aligned @ pose, se3.inverse(result.truth[k])) for k, pose in poses.items()
         )
+        why = (
+            f"of a pose relative to the first, whose own error is in all others; {least_deg:.2f}° if all are aligned "
+            "to the truth together, as by <code>modeler evaluate</code>"
+        )
+        figures.append((f"{off.max_rotation_deg:.2f}°", "largest rotation error", why))
     cells = "".join(f"<div><b>{value}</b>{words}<p class='quiet'>{why}</p></div>" for value, words, why in figures)
     where = escape(str(report["sequence"]))
     return (
@@ -166,9 +174,21 @@ def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[
             "Standard deviation (sd) along the least certain axis: of each edge (the relative pose of two frames by "
             "registration), and of each pose relative to the first frame, before loop closure (edges of "
             "consecutive frames, one after another, so that their errors add up) and after the pose graph of all edges "
-            "was optimised. The gap between the two lines is the effect of loop closure.",
+            f"was optimised. {_effect(result, centre_m)}",
         ),
     ]
+
+
+def _effect(result: Result, centre_m: Array) -> str:
+    """Return in words what loop closure did to the uncertainty of the poses."""
+    both = (result.chain, result.poses)
+    before, after = (np.array([astuple(sd) for sd in plots.sds(poses, centre_m)]).max(axis=0) for poses in both)
+    if (after <= before).all():
+        return "The gap between the two lines is the effect of loop closure."
+    return (
+        "Poses may be less certain after optimisation than before: then the loops showed that errors are larger than "
+        "the edges state, or that all edges share some, such as that of the focal length."
+    )
 
 
 def _closure(result: Result, rows: Mapping[str, Mapping[int, Row]]) -> Sequence[str]:
@@ -202,8 +222,9 @@ def _accuracy(result: Result, centre_m: Array) -> Sequence[str]:
         "<h2>Errors against ground truth</h2>",
         figure(
             plots.errors(result, centre_m),
-            "Lines: errors relative to the first frame. Bands: the estimated sd along the least certain axis. Errors "
-            "far above their band mean that the covariances are too small, or that the ground truth is inaccurate.",
+            "Lines: errors relative to the first frame. Bands: 95 % of the errors are inside if the covariances are "
+            "right. The error of the first frame is in all of them, so that many may leave the band together. Errors "
+            "far above it mean that the covariances are too small, or that the ground truth is inaccurate.",
         ),
         "<h2>Calibration of the covariances</h2>",
         figure(
@@ -405,7 +426,7 @@ CHECKS: Final = {
     ),
     "pose_sd_m": Check(
         "largest sd of a pose's position",
-        "At the limit, one pose in twenty displaces the surface by more than 5 mm.",
+        "At the limit, one pose in twenty displaces the surface by more than the tolerance.",
         1000.0,
         " mm",
     ),
