@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from command_runner import Run
 from PIL import Image
+from scipy.ndimage import binary_dilation
 
 from modeler.cli import main
 from modeler.export.posed_images import PosedImages, write_nerfstudio
@@ -69,7 +70,7 @@ def test_initial_points_of_nerfstudio_lie_where_its_images_show_them(exported: P
         assert (z < 0.0).all()
         column = np.floor(content["cx"] + content["fl_x"] * x / -z).astype(int)
         row = np.floor(content["cy"] - content["fl_y"] * y / -z).astype(int)
-        assert (mask[row, column] > 0).mean() > 0.95
+        assert binary_dilation(mask > 0)[row, column].mean() > 0.99  # the rim falls to either side
         seen = np.abs(depth_mm[row, column] / 1000.0 + z) < 3e-3
         assert seen.mean() > 0.2
         assert np.median(np.abs(rgba[row, column, :3] - colours)[seen]) < 12.0
@@ -137,5 +138,5 @@ def test_without_colour_there_is_nothing_to_learn_from(cli: Run, scene: Path, bu
     shutil.copytree(scene, grey)
     shutil.rmtree(grey / "rgb")
     ended = cli("export", built, "--for", "nerfstudio", "--out", tmp_path / "out", "--sequence", grey)
-    assert (ended.status, ended.err.count("\n")) == (2, 1)
-    assert "no colour" in ended.err
+    assert ended.status == 2
+    assert "no colour" in ended.err.splitlines()[-1]

@@ -7,22 +7,26 @@ functions, so that help appears at once.
 import contextlib
 import errno
 import importlib
+import inspect
 import io
 import logging
 import os
 import re
 import resource
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Union
 
 import tyro
 
+from modeler.cli import messages
 from modeler.cli.batch import Batch
 from modeler.cli.build import Build
 from modeler.cli.calibrate import CalibrateCamera, CalibrateSensor
@@ -84,8 +88,9 @@ _STYLE = (
 )
 _DESCRIPTION = (
     "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr. "
-    "--version prints the version."
+    f"--version prints the version. {messages.HELP}"
 )
+complain = partial(say, level=logging.ERROR)
 _ROOM = 7 * 2**27  # bytes of addresses that registering two frames takes, a third of them used
 _FILES = 256  # open at the same time: Rerun ends the process where it cannot open its own
 _THREAD_DIGITS = 3
@@ -102,6 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_standard_streams()
     share_one_heap()
     logging.basicConfig(level=logging.WARNING, format="modeler: %(message)s")  # to stderr
+    if not any(isinstance(handler, messages.ToLog) for handler in logging.root.handlers):
+        logging.root.addHandler(messages.ToLog())
     for handler in logging.root.handlers:
         handler.addFilter(worded_as_options)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of a home that it cannot write to
@@ -112,9 +119,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be text
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        asked, words = messages.split(arguments)
+        with messages.kept(asked, arguments):
+            return _ended(words)
+    except messages.Wrong as error:
+        complain(str(error))
+        return 2
+
+
+def _ended(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit status, whatever happens."""
     try:
         try:
-            return _run(parsed(sys.argv[1:] if arguments is None else arguments))
+            return _run(parsed(arguments))
         finally:
             sys.stdout.flush()  # so that a closed pipe is noticed here
     except BrokenPipeError:
@@ -122,21 +141,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (MemoryError, OSError, RuntimeError, ImportError) as error:
         if _exhausted(error):
-            say("memory or threads are exhausted; raise the limits (ulimit -v, -u), or end other programs")
+            complain("memory or threads are exhausted; raise the limits (ulimit -v, -u), or end other programs")
             return 2
         if isinstance(error, ModuleNotFoundError) and not (error.name or "modeler").startswith("modeler"):
-            say(f"the package {error.name} is not installed, which this command needs; run make setup")
+            how = f"run make setup, or {shlex.quote(sys.executable)} -m pip install {error.name}"
+            complain(f"the package {error.name} is not installed, which this command needs; {how}")
             return 2
         if not isinstance(error, OSError) or error.errno is None:
             raise
         if error.filename is not None:
-            say(f"{error.filename}: cannot be used ({error.strerror}); check the path and its permissions")
+            complain(f"{error.filename}: cannot be used ({error.strerror}); check the path and its permissions")
             return 2
         _close_stdout()
-        say(f"output cannot be written ({os.strerror(error.errno)}); free disk space, or redirect it")
+        complain(f"output cannot be written ({os.strerror(error.errno)}); free disk space, or redirect it")
         return 2
     except KeyboardInterrupt:
-        say("interrupted")
+        complain("interrupted")
         return INTERRUPTED
 
 
@@ -146,7 +166,7 @@ def parsed(arguments: Sequence[str]) -> Command:
     Raises:
         SystemExit: with status 0 after help or version, with 2 and one line on stderr for invalid arguments.
     """
-    name, *others = arguments or ("",)
+    name, *others = messages.split(arguments)[1] or ("",)
     if name == "help":
         name, others = (others[0], ["--help"]) if others[:1] and others[0] in COMMANDS else ("--help", [])
     if name == "--version":
@@ -161,15 +181,16 @@ def parsed(arguments: Sequence[str]) -> Command:
         kind = "option" if name.startswith("-") else "command"
         wrong = f"unknown {kind} '{name}'" if name else "no command given"
         hint = f"did you mean '{near[0]}'?" if near else f"the commands are {', '.join(COMMANDS)};"
-        say(f"{wrong}; {hint} see modeler --help")
+        complain(f"{wrong}; {hint} see modeler --help")
         raise SystemExit(2)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(COMMANDS[name], prog=f"modeler {name}", args=others, config=_STYLE)
+            told = f"{inspect.cleandoc(COMMANDS[name].__doc__ or '')}\n\n{messages.HELP}"
+            return tyro.cli(COMMANDS[name], prog=f"modeler {name}", description=told, args=others, config=_STYLE)
     except SystemExit as ending:
         if ending.code:
-            say(f"{_one_line(box.getvalue())}; see modeler {name} --help")
+            complain(f"{_one_line(box.getvalue())}; see modeler {name} --help")
         raise
 
 
@@ -220,7 +241,7 @@ def _run(command: Command) -> int:
             _check_names(command)
             return command.run()
     except InputError as error:
-        say(str(error).strip().removesuffix("."))
+        complain(str(error).strip().removesuffix("."))
         return 2
 
 
@@ -248,17 +269,17 @@ def _check_environment() -> None:
     """
     threads, interpreted = (os.environ.get(f"NUMBA_{name}", "") for name in ("NUM_THREADS", "DISABLE_JIT"))
     if threads and not (threads.isdecimal() and len(threads) <= _THREAD_DIGITS and int(threads) > 0):
-        say(f"NUMBA_NUM_THREADS={threads[:99]} is not a number of threads; set it to 1 or more, or unset it")
+        complain(f"NUMBA_NUM_THREADS={threads[:99]} is not a number of threads; set it to 1 or more, or unset it")
         raise SystemExit(2)
     if interpreted not in ("", "0"):
-        say(f"NUMBA_DISABLE_JIT={interpreted} would leave the kernels uncompiled; unset it")
+        complain(f"NUMBA_DISABLE_JIT={interpreted} would leave the kernels uncompiled; unset it")
         raise SystemExit(2)
     for name in [name for name in os.environ if name.startswith(("NUMBA_", "RERUN"))]:
         if name not in ("NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR"):
             del os.environ[name]
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < _FILES:
-        say(f"{hard} open files are too few; allow {_FILES} or more (ulimit -n)")
+        complain(f"{hard} open files are too few; allow {_FILES} or more (ulimit -n)")
         raise SystemExit(2)
     if soft < _FILES:
         resource.setrlimit(resource.RLIMIT_NOFILE, (_FILES, hard))

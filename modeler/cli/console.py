@@ -9,11 +9,14 @@ import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
+
+from modeler.cli.messages import MESSAGES, is_quiet
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -26,14 +29,24 @@ T = TypeVar("T")
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the convention of shells."""
 _AGAIN_S = 0.05  # until a signal is sent again that arrived where nothing can be raised
+_PAIRS_TIMED = 3  # until it is said how long all takes
+_WHOLE = 2.6  # a build takes so many times its pass over the frames: 2.4 for the bundled box, 2.75 for the capture cap
+_WORTH_SAYING_S = 20.0
+_PULSE_S = 30.0  # between signs of life where there is no bar
 _ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
 
-def say(words: str) -> None:
-    """Print a one-line message; unprintable characters from inputs are escaped."""
+def say(words: str, level: int = logging.INFO) -> None:
+    """Print a one-line message; unprintable characters from inputs are escaped.
+
+    Args:
+        words: the message.
+        level: ERROR is printed with `-q`, too, DEBUG only with `-v`.
+    """
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(as_options(words).split()))
-    with lost_without_harm():
-        print("modeler:", line, file=sys.stderr)
+    if MESSAGES.note(line, level):
+        with lost_without_harm():
+            print("modeler:", line, file=sys.stderr)
 
 
 def as_options(words: str) -> str:
@@ -199,7 +212,14 @@ def bar() -> Progress:
         TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )
-    return Progress(*columns, console=terminal, disable=not terminal.is_terminal)
+    return Progress(*columns, console=terminal, disable=is_quiet() or not terminal.is_terminal)
+
+
+def _rounded(seconds: float) -> str:
+    """Return a duration in words, to about a tenth."""
+    if seconds < 90.0:
+        return f"{10 * max(1, round(seconds / 10.0))} s"
+    return f"{max(2, round(seconds / 60.0))} min"
 
 
 class Console:
@@ -217,6 +237,8 @@ class Console:
         self._reported, self._aloud = "", 0
         self._held: list[int] = []  # frames left out for the same reason as those reported last
         self._state, self._enough = "", False
+        self._began_s: float | None = None
+        self._told_s = time.monotonic()
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -280,6 +302,7 @@ class Console:
         before, self._placed[frame] = self._placed.get(frame), accepted
         if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:
             self._unsure.add(frame)
+        self._expect()
         self._state = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=self._state)
         if step.left_out is not None and before is None:
@@ -288,11 +311,29 @@ class Console:
             self._report_frame(frame, "placed on retry")
         elif accepted:
             self._release()
+        if accepted:
+            seconds = sum(posterior.seconds for posterior in step.posteriors)
+            self._say(f"frame {frame}: {self._state}; {seconds:.2f} s of registration", logging.DEBUG)
+
+    def _expect(self) -> None:
+        """Say once, after the first pairs, how long all of it takes; without a bar, now and then how far it is."""
+        now_s, done = time.monotonic(), len(self._placed)
+        if self._began_s is None:
+            self._began_s = now_s
+        elif done == _PAIRS_TIMED + 1 < self._frames:
+            whole_s = _WHOLE * (now_s - self._began_s) / _PAIRS_TIMED * self._frames
+            if whole_s > _WORTH_SAYING_S:
+                self._say(f"{self._frames} frames: to register, close loops and fuse takes about {_rounded(whole_s)}")
+        elif not self.watched and now_s - self._told_s > _PULSE_S:
+            self._say(f"frame {done} of {self._frames}")
 
     def _show_stage(self, stage: str, done: int, total: int) -> None:
         """Show the progress after the last frame."""
         if stage != self._stage:
             self._stage = stage
+            self._say(stage, logging.DEBUG)
+        elif total > 1 and not self.watched and time.monotonic() - self._told_s > _PULSE_S:
+            self._say(f"{stage}: {done} of {total}")
             self._bar.update(self._task, total=None, description=stage)  # forgets how fast the stage before went
         self._bar.update(self._task, completed=done, total=total, description=stage)
 
@@ -326,6 +367,9 @@ class Console:
         self._advised.add(what_to_do)
         return f"{what}: {what_to_do}"
 
-    def _say(self, text: str) -> None:
-        with lost_without_harm():
-            self._bar.console.print(f"modeler: {as_options(text)}", markup=False)
+    def _say(self, text: str, level: int = logging.INFO) -> None:
+        line = as_options(text)
+        if MESSAGES.note(line, level):
+            self._told_s = time.monotonic()
+            with lost_without_harm():
+                self._bar.console.print(f"modeler: {line}", markup=False)

@@ -223,7 +223,7 @@ def _volume(options: Export) -> FusionVolume | None:
     from modeler.fusion import Fuser
     from modeler.runs.reopening import reopened
 
-    run = reopened(options.run_folder, options.moved.sequence)
+    run = reopened(options.run_folder, options.moved.sequence, say)
     return run.volume(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
 
 

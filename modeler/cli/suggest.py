@@ -57,7 +57,7 @@ class Suggest:
 
         goal, asked = self._goal()
         given = None if self.candidates is None else read_candidates(self.candidates)
-        run = reopened(self.run_folder, self.moved.sequence)
+        run = reopened(self.run_folder, self.moved.sequence, say)
         part, *others = run.parts
         if others:
             raise InputError(f"{self.run_folder}: joins several runs; give one of them")

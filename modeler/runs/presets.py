@@ -136,7 +136,7 @@ class Preset:
 
     @cached_property
     def _reopened(self) -> Reopened:
-        return reopened(self.run_folder, self.sequences)
+        return reopened(self.run_folder, self.sequences, self.say)
 
     @cached_property
     def _volume(self) -> FusionVolume:
@@ -260,6 +260,7 @@ class Preset:
         place = files.placement(whole, self._reopened.report, "base", "z")
         density = self.density_kg_m3 or _DENSITY_KG_M3
         body = solids.body_of(place.placed(whole), density_kg_m3=density, mass_kg=self.mass_kg)
+        self.say("finding convex parts, which takes some 10 s with CoACD")
         parts = solids.convex_parts(place.placed(whole))
         model, texture = self._coloured(whole)
         of = solids.PhysicsFiles(self.out, texture is not None)

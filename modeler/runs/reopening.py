@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -225,12 +225,13 @@ class Reopened:
         return fuser.volume(self.views, self.solution.trajectory, conditional_covariances(self.solution, self.edges))
 
 
-def reopened(run: Path, moved: Sequence[Path] = ()) -> Reopened:
+def reopened(run: Path, moved: Sequence[Path] = (), announce: Callable[[str], None] = lambda words: None) -> Reopened:
     """Return a run with its views, made from the sequence again with the run's settings.
 
     Args:
         run: run folder.
         moved: where its sequence is now, of joined runs all of theirs in order; none: where they were.
+        announce: receives in words what follows, once the sequence is found.
 
     Raises:
         InputError: if the folder holds no finished run, or a sequence is not to be found or is another.
@@ -239,6 +240,9 @@ def reopened(run: Path, moved: Sequence[Path] = ()) -> Reopened:
     poses = {frame: pose.mean for frame, pose in poses_of(report).items()}
     if not poses:
         raise InputError(f"{run}: no frame was accepted; build the run again")
+    total_s = (report.get("seconds") or {}).get("total")
+    took = "" if total_s is None else f"; the build took {total_s:.0f} s"
+    announce(f"preparing {len(poses)} frames again{took}")
     views = {frame: view for part in parts for frame, view in part.views(part.accepted).items()}
     if not poses.keys() <= views.keys():
         raise InputError(f"{run}: its parts have changed since they were joined; join them again")
