@@ -17,6 +17,11 @@ A sequence to a model, in a run folder as `modeler build` writes it:
     result = modeler.build("sequences/bundled/box", "runs/box", prior="table")
     result.trustworthy, result.model.vertices_m, result.solution.trajectory
 
+The frames may come from a program, and every event of the run go to functions of its own:
+
+    frames = (modeler.Frame.of(depth_m, (fx, fy, cx, cy), number) for number, depth_m in enumerate(depths_m))
+    result = modeler.build(frames, sinks=[print])
+
 An object found in new images with its model, and followed:
 
     tracker = modeler.Tracker(modeler.known_object("runs/box").model)

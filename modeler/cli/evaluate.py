@@ -27,10 +27,11 @@ class Evaluate:
 
     Writes results.json, results.csv and rotation_errors.png (box plots), and prints a table: errors of rotation in
     degrees and of position in mm (median, 90 % quantile, largest), the median NEES (5.3 if calibrated), the rotation
-    that is left after a closed turn and the sum of its steps, and seconds a pair. For run folders, it
-    compares the model with the true surface instead (model.ply of a rendered sequence, BOP's models folder), and also a
-    model of the same frames with their true poses: models.json, models.csv and a table. Runs without ground truth are
-    left out, and the status is 2.
+    that is left after a closed turn and the sum of its steps, and seconds a pair. For run folders, it compares the
+    model with the true surface instead (model.ply of a rendered sequence, BOP's models folder), and also a model of the
+    same frames with their true poses: models.json, models.csv and a table, in which max deg is the largest rotation
+    error of a pose after all are aligned to the truth together. Runs without ground truth are left out, and the status
+    is 2.
     """
 
     sequences: Annotated[
