@@ -32,6 +32,7 @@ from modeler.cli.build import Build
 from modeler.cli.calibrate import CalibrateCamera, CalibrateSensor
 from modeler.cli.console import INTERRUPTED, endable, say, worded_as_options
 from modeler.cli.convert import Convert
+from modeler.cli.edit import Edit
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
 from modeler.cli.info import Info
@@ -58,6 +59,7 @@ Command = (
     | Export
     | Track
     | Join
+    | Edit
     | Suggest
     | Gallery
 )
@@ -77,6 +79,7 @@ COMMANDS: dict[str, type[Command]] = {
     "export": Export,
     "track": Track,
     "join": Join,
+    "edit": Edit,
     "suggest": Suggest,
     "gallery": Gallery,
 }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
 from modeler.runs.reopening import Part, Reopened, renumbered, reopened
-from modeler.types import FrameRecord, InputError, Outcome, RayImage, Segmentation, Solution, Step, Verdict
+from modeler.types import Edge, FrameRecord, InputError, Outcome, RayImage, Segmentation, Solution, Step, Verdict
 from modeler.verdict import judged
 from modeler.viz.stream import open_stream
 
@@ -82,7 +83,12 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
     )
     with locked(out):
         folder = RunFolder.open(out, overwrite=overwrite)
-        report, verdict = _written(folder, (first, second), graph, solve(graph, guess), meta, began_s=began_s)
+        sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
+        judge = partial(judged, depth_scale_sigma=sigma)
+        shown = [edge for edge in graph.edges if edge.source in second.views and edge.target in first.views]
+        report, verdict = write_run(
+            folder, (first, second), graph, solve(graph, guess), meta, shown=shown, judge=judge, began_s=began_s
+        )
         folder.finish()
     return Joined(alignments, report, verdict)
 
@@ -119,39 +125,52 @@ def _shifted(run: Reopened, offset: int) -> Reopened:
     return replace(run, report=report, views=views, edges=edges, solution=solution)
 
 
-def _written(
+def write_run(
     folder: RunFolder,
-    parts: tuple[Reopened, Reopened],
+    parts: Sequence[Reopened],
     graph: PoseGraph,
     solution: Solution,
     meta: RunMeta,
     *,
+    shown: Sequence[Edge],
+    judge: Callable[[Step], Verdict],
     began_s: float,
 ) -> tuple[Mapping[str, Any], Verdict]:
-    """Fuse the frames of both parts, write the run folder with its recording and return its report and verdict."""
-    views = dict(parts[0].views) | dict(parts[1].views)
-    model = Fuser().fuse(views, solution.trajectory, conditional_covariances(solution, graph.edges))
+    """Fuse the frames of finished runs anew, write a run folder with its recording, and return report and verdict.
+
+    Args:
+        folder: to write to.
+        parts: the runs, whose frames have different numbers.
+        graph: of all their frames.
+        solution: its poses.
+        meta: contents of the report besides the results.
+        shown: edges whose best is drawn as the newest pair.
+        judge: returns the verdict on the last step.
+        began_s: when the work began, by `time.perf_counter`.
+    """
+    views = {frame: view for part in parts for frame, view in part.views.items()}
+    model = Fuser(voxel_m=meta.settings.get("voxel_m")).fuse(
+        views, solution.trajectory, conditional_covariances(solution, graph.edges)
+    )
     names = [field.name for field in fields(FrameRecord)]
     records = [
         FrameRecord(**{name: record[name] for name in names if name in record})
         for part in parts
         for record in part.report["frames"]
     ]
-    depth_scale_sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
-    joining = tuple(edge for edge in graph.edges if edge.source in parts[1].views and edge.target in parts[0].views)
-    best = max((edge.posterior for edge in joining if edge.accepted), key=lambda posterior: posterior.overlap)
+    best = max((edge.posterior for edge in shown if edge.accepted), key=lambda posterior: posterior.overlap)
     first, root = min(views), {min(views): np.eye(4)}
     begun = _step(views[first], solution=Solution(root, odometry=root), views={first: views[first]})
     step = replace(
         _step(views[best.source], solution=solution, views=views),
         posteriors=(best,),
-        edges=joining,
+        edges=tuple(shown),
         make_model=lambda: model,
         edges_so_far=graph.edges,
         frames_so_far=tuple(sorted(records, key=lambda record: record.id)),
         last=True,
     )
-    verdict = judged(step, depth_scale_sigma=depth_scale_sigma)
+    verdict = judge(step)
     step = replace(step, verdict=verdict)
     facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
     stream = open_stream(" + ".join(part.name for part in parts), save=folder.path / "recording.rrd", facts=facts)

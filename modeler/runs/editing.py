@@ -1,0 +1,118 @@
+"""A finished run without some of its frames: optimised and fused again, without registering again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from modeler import se3
+from modeler.composition.compose import comes_back
+from modeler.export import RunFolder, RunMeta, locked
+from modeler.graph import PoseGraph, solve
+from modeler.runs.joining import write_run
+from modeler.runs.reopening import Reopened, reopened
+from modeler.types import Edge, InputError, Verdict
+from modeler.verdict import judged
+
+
+@dataclass(frozen=True, eq=False)
+class Edited:
+    """Result of an edit."""
+
+    report: Mapping[str, Any]
+    """As in report.json."""
+    verdict: Verdict
+    """Whether the model can be trusted."""
+    unconnected: tuple[int, ...]
+    """Frames that only those dropped joined to the others: they are left out, too."""
+
+
+def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> Edited:
+    """Optimise and fuse a run anew without some of its frames.
+
+    The camera keeps the focal length that the run found. Frames that are dropped are not in the new report, whose
+    settings name them.
+
+    Args:
+        run: run folder.
+        dropped: numbers of frames of its model.
+        out: run folder to create; the run's own, to replace it.
+        overwrite: whether another run there may be replaced.
+
+    Raises:
+        InputError: if the run cannot be read, has no such frame, or too few are left.
+    """
+    began_s = time.perf_counter()
+    before = reopened(run)
+    poses = before.solution.trajectory
+    if unknown := sorted(set(dropped) - poses.keys()):
+        raise InputError(
+            f"{run}: frame {unknown[0]} is not in the model; its frames are {', '.join(map(str, sorted(poses)))}"
+        )
+    rest = {frame: pose for frame, pose in poses.items() if frame not in dropped}
+    if len(rest) < 2:
+        raise InputError(f"{run}: of its {len(poses)} frames {len(rest)} would be left; keep at least 2")
+    joined = _largest(rest, before.edges)
+    if len(joined) < 2:
+        raise InputError(f"{run}: no two frames are joined without those dropped; drop others")
+    unconnected = tuple(sorted(rest.keys() - joined))
+    edges = tuple(edge for edge in before.edges if {edge.source, edge.target} <= joined)
+    first = min(joined)
+    graph, first_from_object = (
+        PoseGraph(edges, first),
+        se3.inverse(rest[first]),
+    )  # the first camera's is the object's frame
+    solution = solve(graph, {frame: first_from_object @ rest[frame] for frame in sorted(joined)})
+    part = _without(before, {*dropped, *unconnected})
+    report, settings = before.report, dict(before.report["settings"])
+    made = RunFolder(out)
+    for name in ("sensor", "camera"):
+        if name in settings:
+            settings[name] = made.stored(RunFolder(run).located(settings[name]))
+    if "joined" in settings:
+        settings["joined"] = [made.stored(RunFolder(run).located(part)) for part in settings["joined"]]
+    settings["dropped"] = sorted({*settings.get("dropped", ()), *dropped, *unconnected})
+    sequences = [made.stored(RunFolder(run).located(one)) for one in report["sequence"].split(" + ")]
+    meta = RunMeta(" + ".join(sequences), report["seed"], report["prior"], settings, report.get("camera"))
+    judge = partial(judged, **_expectations(before, meta))
+    same = out.resolve() == run.resolve()
+    with locked(out):
+        folder = RunFolder.open(out, overwrite=overwrite and not same, resume=same)
+        found, verdict = write_run(folder, (part,), graph, solution, meta, shown=edges, judge=judge, began_s=began_s)
+        folder.finish()
+    return Edited(found, verdict, unconnected)
+
+
+def _largest(frames: Collection[int], edges: Collection[Edge]) -> set[int]:
+    """Return the most of some frames that accepted edges join."""
+    group = {frame: {frame} for frame in frames}
+    for edge in edges:
+        if edge.accepted and edge.source in group and edge.target in group:
+            both = group[edge.source] | group[edge.target]
+            group |= dict.fromkeys(both, both)
+    return max(group.values(), key=lambda some: (len(some), -min(some)))
+
+
+def _without(run: Reopened, frames: Collection[int]) -> Reopened:
+    """Return a run without some frames."""
+    report = dict(run.report) | {"frames": [one for one in run.report["frames"] if one["id"] not in frames]}
+    return replace(run, report=report, views={k: view for k, view in run.views.items() if k not in frames})
+
+
+def _expectations(run: Reopened, meta: RunMeta) -> dict[str, Any]:
+    """Return what the verdict on a run depends on besides its last step."""
+    sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
+    part, *others = run.parts
+    if others:
+        return {"depth_scale_sigma": sigma}
+    parts, tolerance_mm = part.modeler(), meta.settings.get("tolerance_mm")
+    return {
+        "depth_scale_sigma": sigma,
+        "prior": parts.prior,
+        "closure_expected": comes_back(part.sequence, parts.prior, parts.closer.max_angle_deg),
+        "tolerance_m": None if tolerance_mm is None else 1e-3 * tolerance_mm,
+    }
