@@ -16,9 +16,9 @@ from modeler.segmentation.planes import dominant_planes, heights
 from modeler.tracking.rendering import ModelRenderer
 from modeler.types import Array, BoolArray, Frame
 
-_SCENERY = 1.4  # widths of the model: larger planes are tables and walls
+_SCENERY = 0.7  # squares of the model's width: larger planes are tables and walls; a cube's face is a third of one
+_GRAZING = 0.05  # least cosine of a plane with the line of sight, below which its area is not known
 _LEAST, _MOST = 0.15, 1.3  # extent of a piece, in widths of the model
-_STRIP = 2  # pixels of the downsampled image
 _LEAST_PX = 100  # of a piece, as of the segmenter
 _AROUND = 1.1  # radii of the model around the seed of a part of a larger piece
 _REACH = 0.15  # radii of the model by which it may have moved beyond its prediction
@@ -45,19 +45,20 @@ class CandidateFinder:
         off = self._off_scenery(frame, points, width_m)
         labels = pieces(frame.depth_m, off)
         counts = np.bincount(labels.ravel())
-        found: list[tuple[float, BoolArray]] = []
+        found: list[tuple[bool, float, BoolArray]] = []
         for label in np.flatnonzero(counts >= _LEAST_PX):
             if label == 0:
                 continue
             piece = labels == label
             for part in self._parts(piece, points, renderer):
+                whole = part is piece
                 if np.count_nonzero(part) >= _LEAST_PX:
                     low_m, high_m = np.percentile(points[part], [2.0, 98.0], axis=0)
                     extent = float(np.linalg.norm(high_m - low_m)) / width_m
                     if _LEAST < extent < _MOST:
-                        found.append((abs(np.log(extent)), without_specks(part)))
-        found.sort(key=lambda one: one[0])
-        return [mask for _, mask in found[: self.most]]
+                        found.append((not whole, abs(np.log(extent)), without_specks(part)))
+        found.sort(key=lambda one: one[:2])  # whole pieces first
+        return [mask for _, _, mask in found[: self.most]]
 
     def near(self, frame: Frame, camera_from_model: Array, renderer: ModelRenderer) -> BoolArray:
         """Return the mask (h, w) of what is near the model in a pose (4, 4), and not part of tables and walls."""
@@ -93,17 +94,18 @@ class CandidateFinder:
         pixel_m = (depth_m / frame.camera.fx).astype(np.float32)
         off: BoolArray = np.isfinite(depth_m) & ~mixed_pixels(depth_m, tolerance_m=tolerance_m, pixel_m=pixel_m)
         thin = points[::stride, ::stride]
+        rays = thin / thin[..., 2:]
+        pixel_m2 = (stride * thin[..., 2]) ** 2 / (frame.camera.fx * frame.camera.fy)
         for plane in dominant_planes(thin, self.noise):
             on = np.abs(heights(points, plane)) < tolerance_m
-            # Where a plane that continues an object's side cuts the table, strips remain, which are opened.
-            opened = np.asarray(ndimage.binary_opening(on[::stride, ::stride], iterations=_STRIP), dtype=np.bool_)
-            labels = pieces(thin[..., 2], opened)
-            for label, where in enumerate(ndimage.find_objects(labels), 1):
-                flat = thin[where][labels[where] == label]
-                if np.linalg.norm(np.ptp(flat, axis=0)) > _SCENERY * width_m:
-                    wide = np.asarray(ndimage.binary_dilation(labels == label, iterations=_STRIP + 1), dtype=np.bool_)
-                    wide = np.repeat(np.repeat(wide, stride, axis=0), stride, axis=1)[: off.shape[0], : off.shape[1]]
-                    off &= ~(on & wide)
+            area_m2 = pixel_m2 / np.maximum(np.abs(rays @ plane[:3].astype(np.float32)), _GRAZING)
+            labels = pieces(thin[..., 2], on[::stride, ::stride])
+            areas = np.bincount(labels.ravel(), np.where(labels > 0, area_m2, 0.0).ravel())
+            large = np.flatnonzero(areas > _SCENERY * width_m**2)
+            if len(large):
+                wide = np.asarray(ndimage.binary_dilation(np.isin(labels, large), iterations=2), dtype=np.bool_)
+                wide = np.repeat(np.repeat(wide, stride, axis=0), stride, axis=1)[: off.shape[0], : off.shape[1]]
+                off &= ~(on & wide)
         return off
 
     def _parts(self, piece: BoolArray, points: np.ndarray, renderer: ModelRenderer) -> Iterator[BoolArray]:

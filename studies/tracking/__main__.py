@@ -106,8 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--captures", nargs="*", type=Path, default=(), metavar="SEQUENCE", help="recordings")
     parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
-    parser.add_argument("--shapes", type=int, default=12, metavar="N", help="rendered shapes, in all")
-    parser.add_argument("--scenes", type=int, default=8, metavar="N", help="scenes of each")
+    parser.add_argument("--shapes", type=int, default=8, metavar="N", help="rendered shapes, in all")
+    parser.add_argument("--scenes", type=int, default=5, metavar="N", help="scenes of each")
     parser.add_argument("--out", type=Path, default=Path("runs/tracking"), metavar="DIR", help="runs and results")
     parser.add_argument("--record", action="store_true", help="put the figures into their file")
     options = parser.parse_args(arguments)
@@ -172,7 +172,7 @@ def captured(sequences: Sequence[Path], out: Path, done: set[tuple[str, str]]) -
             tracker = Tracker(thing.model, sensor, independent=True, segmenter=parts.segmenter, scene=segmented)
             sought = Sought(thing.model, tracker)
             own = other == name
-            frames = sequence.indices[1::2] if own else sequence.indices[:: max(len(sequence.indices) // 2, 1)][:2]
+            frames = sequence.indices[1::2] if own else sequence.indices[len(sequence.indices) // 2 :][:1]
             for index in frames:
                 group, what = (
                     ("captures", f"{name} {index}") if own else ("other captures", f"{name} in {other} {index}")
