@@ -47,6 +47,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "surfacing.captures": ("surfaces and colours of held-out views of captures", "minutes"),
     "surfacing.masks_and_models": ("draw depth, mask and model of runs", "seconds"),
     "symmetries": ("symmetries of shapes of known class", "minutes"),
+    "tracking": ("objects found with their models on cluttered tables and in captures", "an hour"),
     "trust": ("reliability of exit status 0, with and without faults", "20 minutes a core"),
     "turned_over": ("objects that are turned over within one recording", "half an hour"),
 }

@@ -43,7 +43,7 @@ class KnownObject:
         return RefocusedSequence(sequence, self.focal) if same else sequence
 
 
-def known_object(path: Path, unit: Unit | None = None) -> KnownObject:
+def known_object(path: str | Path, unit: Unit | None = None) -> KnownObject:
     """Return the object of a run folder or a mesh file.
 
     Args:
@@ -53,6 +53,7 @@ def known_object(path: Path, unit: Unit | None = None) -> KnownObject:
     Raises:
         InputError: if there is no model, or it cannot be read.
     """
+    path = Path(path)
     if path.is_dir():
         if unit not in (None, "m"):
             raise InputError(f"{path}: models of runs are in m; leave `unit` out")
