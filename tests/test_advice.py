@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from source_trees import ROOT
 
 from modeler import priors, se3
 from modeler.cli.build import Build
+from modeler.cli.console import _options
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import AbstractPrior, Outcome
 from modeler.verdict.advice import remedies, unchecked_focal_length
@@ -139,3 +143,23 @@ def test_the_command_to_try_keeps_what_was_given() -> None:
     assert build.command({"prior": "general"}) == "modeler build 'a b' --out run --overwrite --prior general"
     build = Build(Path("a"), Path("run"), where=ObjectOptions(roi=(1, 2, 3, 4)), method=MethodOptions(seed=3))
     assert build.command({}) == "modeler build a --out run --overwrite --roi 1 2 3 4 --seed 3"
+
+
+def test_messages_name_parameters_and_options_that_exist() -> None:
+    """Parameters stand in backticks, options behind two hyphens, in every text of the sources that is no docstring."""
+    options = {option.removeprefix("--") for option in _options().values()} | {"help", "version", "purpose"}
+    unknown = set()
+    for path in (path for folder in ("modeler", "sequences", "viz") for path in (ROOT / folder).rglob("*.py")):
+        if path.name in ("messages.py", "viewer.py"):  # options of all commands, and those of Rerun
+            continue
+        tree = ast.parse(path.read_text())
+        told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told:
+                named = re.findall(r"`(\w+)`", node.value)
+                named += re.findall(r"(?<![\w-])--([a-z][a-z0-9-]+)", node.value)
+                unknown |= {(path.name, name) for name in named if name.replace("_", "-") not in options}
+    assert unknown == {
+        ("kinect.py", "depth-mode"),
+        ("manifest.py", "no-colour"),
+    }  # of another program; a flag's other side

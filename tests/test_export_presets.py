@@ -241,6 +241,16 @@ def test_usd_holds_a_rigid_body_in_metres(tmp_path: Path, coloured: bool) -> Non
     assert (surface.GetInput("metallic").Get(), surface.GetInput("roughness").Get()) == (0.0, 1.0)
 
 
+def test_a_missing_library_is_said_before_any_work(
+    cli: Run, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    ended = cli("export", built, "--for", "isaac", "--out", tmp_path / "out")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    assert "usd-core is not installed" in ended.err
+    assert "-m pip install 'modeler[usd]'" in ended.err
+
+
 def test_checks_tell_what_does_not_hold(tmp_path: Path) -> None:
     path = tmp_path / "ball.ply"
     trimesh.Trimesh(ball().vertices_m * 1000.0, [*ball().triangles, [0, 0, 1]], process=False).export(path)

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from modeler.cli import main
-from modeler.export.posed_images import PosedImages, write_nerfstudio
+from modeler.export.posed_images import PosedImages, with_unmeasured, write_nerfstudio
 from modeler.sequences import open_sequence
 from modeler.types import Camera, Frame
 
@@ -117,6 +117,19 @@ def test_pycolmap_reads_the_cameras_of_nerfstudio(exported: Path, tmp_path: Path
         np.testing.assert_array_equal(image[..., 3], mask)
         assert len(found["seen"][name]) > 0.2 * len(points)
         assert all(mask[int(y), int(x)] for x, y, _ in found["seen"][name])
+
+
+def test_where_no_depth_was_measured_the_model_says_what_the_object_is() -> None:
+    depth_m = np.ones((3, 4), np.float32)
+    depth_m[0, 1:] = np.nan
+    mask, hand, silhouette = (np.zeros((3, 4), bool) for _ in range(3))
+    mask[1], hand[0, 3], silhouette[:, 1:] = True, True, True
+    frame = Frame(0, 0.0, depth_m, Camera(4, 3, 9.0, 9.0, 1.5, 1.0), mask, None, hand)
+    expected = mask.copy()
+    expected[0, 1:3] = True  # where depth is, the mask decides; at the hand, nothing is the object
+    filled = with_unmeasured(frame, silhouette).mask
+    assert filled is not None
+    np.testing.assert_array_equal(filled, expected)
 
 
 def test_frames_of_two_cameras_have_their_own(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +111,30 @@ def symmetry_entries(
     return {name: values for name, values in entries.items() if values}
 
 
+def silhouettes(
+    model: ObjectModel, frames: Iterable[Frame], camera_from_model: Mapping[int, Array]
+) -> Iterator[tuple[Frame, BoolArray]]:
+    """Yield frames with the pixels (h, w) that the model covers.
+
+    Args:
+        model: the mesh, in m.
+        frames: of the cameras.
+        camera_from_model: (4, 4), m, by frame number.
+    """
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    tensor = o3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(model.vertices_m.astype(np.float32)), tensor(model.triangles.astype(np.uint32)))
+    for frame in frames:
+        pose = camera_from_model[frame.index]
+        w, h = frame.camera.rays()
+        directions = np.stack([w, h, np.ones_like(w)], axis=-1) @ pose[:3, :3]  # rotated into the model's frame
+        origins = np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], directions.shape)
+        rays = tensor(np.concatenate([origins, directions], axis=-1).astype(np.float32))
+        yield frame, np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
+
+
 def scene_gt_info(model: ObjectModel, frames: Iterable[Frame], camera_from_model: Mapping[int, Array]) -> str:
     """Return `scene_gt_info.json` of frames with masks: boxes and counts of pixels, as BOP defines them.
 
@@ -119,19 +143,8 @@ def scene_gt_info(model: ObjectModel, frames: Iterable[Frame], camera_from_model
         frames: with the object's visible pixels as mask.
         camera_from_model: (4, 4), m, by frame number.
     """
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    tensor = o3d.core.Tensor.from_numpy
-    scene.add_triangles(tensor(model.vertices_m.astype(np.float32)), tensor(model.triangles.astype(np.uint32)))
     entries = {}
-    for frame in frames:
-        pose = camera_from_model[frame.index]
-        w, h = frame.camera.rays()
-        directions = np.stack([w, h, np.ones_like(w)], axis=-1) @ pose[:3, :3]  # rotated into the model's frame
-        origins = np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], directions.shape)
-        rays = tensor(np.concatenate([origins, directions], axis=-1).astype(np.float32))
-        silhouette = np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
+    for frame, silhouette in silhouettes(model, frames, camera_from_model):
         visible = np.zeros_like(silhouette) if frame.mask is None else frame.mask
         whole, seen = int(silhouette.sum()), int(visible.sum())
         entries[str(frame.index)] = [

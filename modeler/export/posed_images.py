@@ -10,7 +10,7 @@ import io
 import json
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.export.bop import silhouettes
 from modeler.export.files import write_atomically
 from modeler.export.formats import ply_bytes
 from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel
@@ -48,8 +49,17 @@ class PosedImages:
 
     @classmethod
     def of(cls, model: ObjectModel, frames: Mapping[int, Frame], world_from_camera: Mapping[int, Array]) -> PosedImages:
-        """Return frames with points of a coloured model in the world."""
+        """Return frames with points of a coloured model in the world.
+
+        Depth cameras see the rim of many objects badly, and masks follow depth: where none was measured, the model says
+        what the object is.
+        """
         assert model.vertex_colours is not None
+        camera_from_world = {k: se3.inverse(pose) for k, pose in world_from_camera.items()}
+        frames = {
+            frame.index: with_unmeasured(frame, silhouette)
+            for frame, silhouette in silhouettes(model, frames.values(), camera_from_world)
+        }
         count = len(model.vertices_m)
         some = np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int64))
         return cls(
@@ -71,6 +81,12 @@ class PosedImages:
         depth_m = np.where(object_of(frame), frame.depth_m, np.nan)[rows, columns]
         seen = inside & facing & (np.abs(depth_m - points_m[:, 2]) < tolerance_m)
         return np.flatnonzero(seen), places[seen]
+
+
+def with_unmeasured(frame: Frame, silhouette: BoolArray) -> Frame:
+    """Return a frame whose mask also holds the pixels of a silhouette (h, w) in which no depth was measured."""
+    free = np.isfinite(frame.depth_m) if frame.occluder is None else np.isfinite(frame.depth_m) | frame.occluder
+    return replace(frame, mask=object_of(frame) | (silhouette & ~free))
 
 
 def object_of(frame: Frame) -> BoolArray:
