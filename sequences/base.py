@@ -40,7 +40,6 @@ class AbstractSequence(ABC):
             InputError: if there is no such frame or it cannot be read.
         """
 
-    @abstractmethod
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known.
 
@@ -49,15 +48,16 @@ class AbstractSequence(ABC):
         Raises:
             InputError: if the ground truth cannot be read.
         """
+        return None
 
-    @abstractmethod
     def sensor(self) -> SensorNoise | None:
         """Return the noise of its camera; None if unknown."""
+        return None
 
     @property
-    @abstractmethod
     def motion(self) -> Mapping[str, object] | None:
         """Known motion, `{"kind": "turntable", "step_deg": 25, …}`; None if nothing is known."""
+        return None
 
     @property
     def inputs(self) -> tuple[Path, ...]:
@@ -288,19 +288,6 @@ class GivenSequence(AbstractSequence):
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames that were given and then, once, those to come."""
         return itertools.chain(self.given, self.coming or ())
-
-    def truth(self) -> dict[int, Array] | None:
-        """Return None: it is not known."""
-        return None
-
-    def sensor(self) -> SensorNoise | None:
-        """Return None: unknown."""
-        return None
-
-    @property
-    def motion(self) -> None:
-        """None: nothing is known."""
-        return None
 
 
 def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:

@@ -94,10 +94,6 @@ class CloudSequence(AbstractRecording):
             colour[where] = cloud.colours[far_first]
         return Frame(index, float(index), depth_m, camera, None, colour)
 
-    def truth(self) -> dict[int, Array] | None:
-        """Return None: clouds have no ground truth."""
-        return None
-
     @property
     def layout(self) -> str:
         """Format of the sequence."""

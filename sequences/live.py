@@ -18,7 +18,7 @@ from modeler.sequences.depth_files import metres
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens, coefficients
 from modeler.system.extras import install_command
-from modeler.types import Array, Camera, Frame, InputError, SensorNoise
+from modeler.types import Camera, Frame, InputError
 
 FIRST = 10
 """Number of frames taken before the sequence is described."""
@@ -115,19 +115,6 @@ class LiveSequence(AbstractSequence):
         """
         check_every(every)
         return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
-
-    def truth(self) -> dict[int, Array] | None:
-        """Return None: a camera does not know."""
-        return None
-
-    def sensor(self) -> SensorNoise | None:
-        """Return None: unknown for a camera."""
-        return None
-
-    @property
-    def motion(self) -> None:
-        """None: nothing is known."""
-        return None
 
     @property
     def layout(self) -> str:

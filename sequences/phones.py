@@ -20,7 +20,7 @@ from modeler.sequences.intrinsics import Overrides, camera_of
 from modeler.sequences.recording import AbstractRecording
 from modeler.system.extras import install_command
 from modeler.system.regular_files import open_regular, parse_json
-from modeler.types import Array, Camera, Frame, InputError
+from modeler.types import Camera, Frame, InputError
 
 ADVICE = install_command("phones")
 _AGAIN = "export it again"
@@ -57,10 +57,6 @@ class Record3DSequence(AbstractRecording):
             seen = read_colour(EmbeddedImage(self._content(f"rgbd/{index}.jpg"), where))
             colour = resize_to_depth(Path(where), seen, size)
         return Frame(index, self.times_s[index], depth_m, self.camera, None, colour)
-
-    def truth(self) -> dict[int, Array] | None:
-        """Return None: phones have no ground truth of objects."""
-        return None
 
     @property
     def layout(self) -> str:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from modeler.sequences.base import AbstractSequence, span
 from modeler.sequences.input_files import Node, is_there, read_tree
 from modeler.sequences.lens import Lens
-from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Array, Frame, InputError, SensorNoise
+from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Frame, InputError, SensorNoise
 
 
 @dataclass(frozen=True)
@@ -204,10 +204,6 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
         depth_m = self.lens.undistort(self.seen_m(index, pair.depth), float("nan"))
         colour = None if pair.colour is None else self.colour_at(index, pair.colour, depth_m)
         return Frame(index, pair.time_s, depth_m, self.lens.camera, None, colour)
-
-    def truth(self) -> dict[int, Array] | None:
-        """Return None: recordings of cameras have no ground truth."""
-        return None
 
     @property
     def notes(self) -> tuple[str, ...]:

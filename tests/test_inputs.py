@@ -258,17 +258,6 @@ class Numbers(AbstractSequence):
     def truth(self) -> dict[int, np.ndarray] | None:
         return {index: np.eye(4) for index in self.numbers}
 
-    def sensor(self) -> None:
-        return None
-
-    @property
-    def motion(self) -> None:
-        return None
-
-    @property
-    def robot_path(self) -> None:
-        return None
-
     @property
     def model_path(self) -> None:
         return None

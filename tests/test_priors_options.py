@@ -32,7 +32,7 @@ from modeler.priors import (
     VelocityPrior,
 )
 from modeler.sequences import AbstractSequence, bundled
-from modeler.types import Array, Frame, SensorNoise
+from modeler.types import Frame
 
 OWN = """
 from dataclasses import dataclass
@@ -73,12 +73,6 @@ class Telling(AbstractSequence):
 
     def frame(self, index: int) -> Frame:
         raise AssertionError
-
-    def truth(self) -> dict[int, Array] | None:
-        return None
-
-    def sensor(self) -> SensorNoise | None:
-        return None
 
 
 TURNTABLE = Telling({"kind": "turntable", "step_deg": 25, "sigma_deg": 3})

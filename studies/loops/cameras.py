@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -74,14 +74,6 @@ class Filmed(AbstractSequence):
     def truth(self) -> dict[int, Array]:
         """Return the true camera_from_model (4, 4) by frame number."""
         return self.rendered.truth()
-
-    def sensor(self) -> None:
-        """Return None: unknown for most cameras."""
-
-    @property
-    def motion(self) -> Mapping[str, object] | None:
-        """Return None."""
-        return None
 
     def model(self) -> Mesh:
         """Return the true surface of the object."""

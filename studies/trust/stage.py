@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -99,14 +99,6 @@ class Recorded(AbstractSequence):
             for index in self.indices
             if not (self.stage.foreign and index >= self.stage.since)
         }
-
-    def sensor(self) -> None:
-        """Return None: unknown for most cameras."""
-
-    @property
-    def motion(self) -> Mapping[str, object] | None:
-        """Return None: it is given by options."""
-        return None
 
     def model(self) -> Mesh:
         """Return the true surface of the object in its model frame, as it is at the start."""
