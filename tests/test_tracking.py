@@ -16,7 +16,7 @@ from modeler.baselines import IcpRegistrar
 from modeler.closure import Closer
 from modeler.pipeline import Modeler
 from modeler.pipeline.attempts import unless_alike
-from modeler.pipeline.pairs import Registrations
+from modeler.pipeline.pairs import Registrations, converged_or
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.registration import VisibilityRegistrar
@@ -211,6 +211,26 @@ def test_modes_beyond_the_limits_count_as_little_as_motions_beyond_do() -> None:
     assert [mode.weight for mode in far.modes] == pytest.approx([0.752, 0.248], abs=1e-3)
     for wide in (of_modes((0.6, -65.0), (0.4, 65.0)), of_modes((0.6, 25.0), (0.4, -40.0)), of_modes((1.0, -65.0))):
         assert unless_alike(cut_off, wide, Limited(LIMIT_DEG)) is wide
+
+
+@pytest.mark.parametrize(
+    ("outcome", "contradicted", "better_nats", "replaced"),
+    [
+        (Outcome.CONVERGED, True, 2.0, False),
+        (Outcome.CONVERGED, True, 3.0, True),
+        (Outcome.CONVERGED, False, 6.5, False),
+        (Outcome.CONVERGED, False, 7.5, True),
+        (Outcome.NO_OVERLAP, False, -50.0, True),
+    ],
+)
+def test_a_match_within_the_limits_gives_way_to_a_more_probable_one(
+    outcome: Outcome, contradicted: bool, better_nats: float, replaced: bool
+) -> None:
+    """One motion in a thousand exceeds the limits, and one right match in a hundred is contradicted by the images."""
+    pose = PoseGaussian(turned(25.0), COVARIANCE)
+    within = Posterior(1, 0, pose, outcome, 0.8, contradicted=contradicted, log_marginal_likelihood=-20.0)
+    beyond = Posterior(1, 0, pose, Outcome.CONVERGED, 0.8, log_marginal_likelihood=-20.0 + better_nats)
+    assert converged_or(within, beyond) is (beyond if replaced else within)
 
 
 # Frames in which something hides the object: what is spent on them, and that those after them join as ever.

@@ -18,7 +18,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure import Closer
-from modeler.pipeline.pairs import converged_or
+from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, converged_or
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
 from modeler.types import (
@@ -42,7 +42,6 @@ FULL: Final = 1.0
 _LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
 _SPAN_STEPS = 2.0  # steps of the limits if the graph predicts the motion, so that they do not truncate it
 _UNEVEN_SHARE = 0.25  # of the way: standard deviation in the middle between two views, if the speed is uneven
-_BEYOND_LIMITS_NATS = 7.0  # one motion in a thousand exceeds the prior's limits
 _MIN_OVERLAP_GAIN = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
 _SEPARATE_RAD = 0.26  # registrations that differ by a larger rotation are two modes
 _MIN_MODE_WEIGHT = 0.01
@@ -282,7 +281,7 @@ def unless_alike(within: Posterior, wider: Posterior, density: AbstractPoseDensi
         inside = wider.outcome is Outcome.CONVERGED and _inside(density, wider.pose.mean[None])[0]
         better_nats = wider.log_marginal_likelihood - within.log_marginal_likelihood
         similar_overlap = wider.overlap < within.overlap + _MIN_OVERLAP_GAIN
-        if separate and not inside and similar_overlap and better_nats < _BEYOND_LIMITS_NATS:
+        if separate and not inside and similar_overlap and better_nats < BEYOND_LIMITS_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)
     return _discounted(wider, density)
 
@@ -294,7 +293,7 @@ def _discounted(posterior: Posterior, density: AbstractPoseDensity) -> Posterior
     inside = _inside(density, np.stack([mode.pose.mean for mode in posterior.modes]))
     if inside.all() or not inside.any():
         return posterior
-    weights = np.array([mode.weight for mode in posterior.modes]) * np.where(inside, 1.0, np.exp(-_BEYOND_LIMITS_NATS))
+    weights = np.array([mode.weight for mode in posterior.modes]) * np.where(inside, 1.0, np.exp(-BEYOND_LIMITS_NATS))
     weights /= weights.sum()
     order = [int(place) for place in np.argsort(-weights, kind="stable") if weights[place] >= _MIN_MODE_WEIGHT]
     total = float(weights[order].sum())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Final, final
 
 import numpy as np
 
@@ -23,6 +23,11 @@ from modeler.types import (
     ViewPair,
 )
 from modeler.views import Sensor
+
+BEYOND_LIMITS_NATS: Final = 7.0
+"""Prior log odds of a motion within the prior's limits: one in a thousand exceeds them."""
+_CONTRADICTED_NATS: Final = 4.6
+"""Log odds against a match that the images contradict: they contradict one of 100 right ones (`Posterior`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +117,16 @@ def without_limits(within: Posterior, prior: AbstractPrior, attempt: Callable[[A
 
 
 def converged_or(within: Posterior, unlimited: Posterior) -> Posterior:
-    """Return the registration without limits if it converged, else the one within limits.
+    """Return the registration without limits if it converged and is more probable, else the one within limits.
 
-    If several modes are found, none within the usual limits, none can be trusted.
+    If several modes are found, none within the usual limits, none can be trusted. A match within the limits is only
+    replaced if the other one's likelihood outweighs that motions beyond them are rare; images that contradict the
+    match speak against it as well.
     """
-    return unlimited if unlimited.outcome is Outcome.CONVERGED else within
+    if unlimited.outcome is not Outcome.CONVERGED:
+        return within
+    if not within.usable:
+        return unlimited
+    needed_nats = BEYOND_LIMITS_NATS - (_CONTRADICTED_NATS if within.contradicted else 0.0)
+    better_nats = unlimited.log_marginal_likelihood - within.log_marginal_likelihood
+    return within if better_nats < needed_nats else unlimited
