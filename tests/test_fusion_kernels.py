@@ -117,13 +117,18 @@ def naive_integrate(voxels, tau_m, empty_weight, voxel_m, views):
             side = [k for k in remaining if votes[k][2] @ votes[best][2] > tsdf.SAME_SIDE]
             weight = sum(votes[k][1] for k in side)
             distance = sum(votes[k][1] * votes[k][0] for k in side) / weight
+            scale_m = max(2.385 / 2**0.5 * (tau_m - 3 * voxel_m) / 2, 0.1 * voxel_m)
+            for _ in range(tsdf.ROBUST_ROUNDS):
+                shares = {k: votes[k][1] / (1 + ((votes[k][0] - distance) / scale_m) ** 2) for k in side}
+                distance = sum(shares[k] * votes[k][0] for k in side) / sum(shares.values())
             opposite = [k for k in remaining if votes[k][2] @ votes[best][2] < -tsdf.SAME_SIDE]
             if opposite:
                 behind = sum(votes[k][1] * votes[k][0] for k in opposite) / sum(votes[k][1] for k in opposite)
                 if -2 * tsdf.THINNEST * voxel_m < distance + behind < tau_m - 2 * voxel_m:
                     distance = abs(distance - behind) / 2 - tsdf.THINNEST * voxel_m
-            totals[number] = max(emptiness, weight)
-            values[number] = (max(0.0, emptiness - weight) * tau_m + weight * distance) / totals[number]
+            excess = max(0.0, emptiness - tsdf.OUTWEIGHED * weight)
+            totals[number] = weight + excess
+            values[number] = (excess * tau_m + weight * distance) / totals[number]
             against = [k for k in remaining if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
             if len(against) < tsdf.MAJORITY * len(side):
                 break

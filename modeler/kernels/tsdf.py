@@ -20,6 +20,8 @@ from modeler.kernels.threads import over_rows
 SIDE = 4  # voxels along the side of a block
 SAME_SIDE = 0.3  # least cosine between normals on the same side of the object; chosen by hand
 THINNEST = 0.75  # half the least thickness of sheets, in voxels: two sides in one and a half are resolved
+OUTWEIGHED = 0.2  # weight of free space, relative to that of votes, which moves nothing; measured: left-out views
+ROBUST_ROUNDS = 3  # of reweighting the votes of a voxel, from their mean; more change little
 MAJORITY = 3  # a side is rejected if this many times as many votes contradict it; chosen by hand
 
 
@@ -347,7 +349,7 @@ def fuse_votes(
         points: (n, 3).
         normals: (n, 3).
     """
-    remaining = seen
+    remaining, scale_m = seen, robust_scale_m(tau_m, voxel_m)
     while True:
         best = dominant_vote(seen, distance, weight, number, normals, tau_m)
         if best < 0:
@@ -367,12 +369,22 @@ def fuse_votes(
             elif cosine < -SAME_SIDE and weight[k] > 0.0:
                 behind += weight[k]
                 behind_value += weight[k] * distance[k]
+        mean = value / total
+        for _ in range(ROBUST_ROUNDS):
+            share = value = 0.0
+            for k in range(seen):
+                if weight[k] > 0.0 and facing(normals, side, normals, number[k]) > SAME_SIDE:
+                    robust = weight[k] / (1.0 + ((distance[k] - mean) / scale_m) ** 2)
+                    share += robust
+                    value += robust * distance[k]
+            mean = value / share
+        value = total * mean
         if behind > 0.0:  # below eq. 12.6
-            mean, other = value / total, behind_value / behind
+            other = behind_value / behind
             if -2.0 * THINNEST * voxel_m < mean + other < tau_m - 2.0 * voxel_m:
                 value = total * (0.5 * abs(mean - other) - THINNEST * voxel_m)
         # eq. 12.5: what few views see through does not move surface that more see.
-        excess = max(0.0, emptiness - total)
+        excess = max(0.0, emptiness - OUTWEIGHED * total)
         result = (value + excess * tau_m) / (total + excess), total + excess
         if remaining < (1 + MAJORITY) * agreeing:
             return result
@@ -385,6 +397,12 @@ def fuse_votes(
             if weight[k] > 0.0 and facing(normals, side, normals, number[k]) > SAME_SIDE:
                 weight[k] = 0.0
                 remaining -= 1
+
+
+@njit(cache=True)
+def robust_scale_m(tau_m, voxel_m):
+    """Return the scale of Cauchy weights of the votes of a band: 2.385 sd of a view, of 95 % efficiency (eq. 12.4)."""
+    return max(2.385 * math.sqrt(0.5) * 0.5 * (tau_m - 3.0 * voxel_m), 0.1 * voxel_m)
 
 
 @njit(cache=True)
