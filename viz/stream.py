@@ -164,14 +164,14 @@ def load() -> None:
 def open_stream(
     name: str,
     *,
-    save: Path | None,
+    save: str | Path | None = None,
     spawn: bool = False,
     web: bool = False,
     connect: str | None = None,
     facts: Mapping[str, object] | None = None,
     advised: bool = False,
 ) -> RerunStream:
-    """Open a recording and the viewer that is to watch it.
+    """Open a recording and the viewer that is to watch it: a sink of a run's events, to be closed at the end.
 
     A viewer that does not start or cannot be reached is reported to the log and left out.
 
@@ -194,7 +194,7 @@ def open_stream(
     from modeler.viz import drawings, images, readings
 
     listens = connect is not None and viewer.reachable(connect)
-    file = None if save is None else RecordingFile(save)
+    file = None if save is None else RecordingFile(Path(save))
     viewers = _own_viewers(spawn=spawn, web=web)
     sinks = [rr.GrpcSink(own.sink) for own in viewers]
     if listens:
