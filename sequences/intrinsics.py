@@ -344,7 +344,9 @@ def _pinhole(node: Node) -> Intrinsics:
     names = next((names for names in _NAMED if node.get(names[0]) and node.get(names[2])), None)
     names = names or next((names for names in _NAMED if node.get(names[2])), None)
     if names is not None:
-        return _as_sane(node, [node.need(name).number() for name in names])
+        corner_px = 0.5 if names[0] == "fl_x" else 0.0  # nerfstudio measures from the corner of the first pixel
+        fx, fy, cx, cy = (node.need(name).number() for name in names)
+        return _as_sane(node, [fx, fy, cx - corner_px, cy - corner_px])
     entry = next((found for key in _MATRICES if (found := node.get(key)) is not None), None)
     if entry is None:
         raise node.fault("intrinsics, with fx, fy, cx and cy in px, or with their matrix as intrinsic_matrix")

@@ -107,7 +107,8 @@ def test_lists_of_nerfstudio_are_read(tmp_path: Path, frames: list[Frame]) -> No
         save(tmp_path / image, larger(frame.colour, 3))
         listed.append({"file_path": image, "depth_file_path": depth, "transform_matrix": np.eye(4).tolist()})
     pixels = enlarged(frames[0].camera, 3.0)
-    facts = {"fl_x": pixels["fx"], "fl_y": pixels["fy"], "cx": pixels["cx"], "cy": pixels["cy"], "w": 480, "h": 360}
+    facts = {"fl_x": pixels["fx"], "fl_y": pixels["fy"], "w": 480, "h": 360}
+    facts |= {"cx": pixels["cx"] + 0.5, "cy": pixels["cy"] + 0.5}  # from the corner of the first pixel
     (tmp_path / "transforms.json").write_text(json.dumps(facts | {"frames": listed}))
     check(tmp_path, frames)
     (tmp_path / "pictures" / "p1.png").unlink()
