@@ -227,6 +227,7 @@ def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rn
     assert np.all(segmenter.noise.sigma_m(np.array([0.6, 0.9])) < 0.0015)
     scene = segmenter.scene(frames)
     assert scene.still
+    assert not scene.camera_moves
     assert scene.noise is not None
     judge(frames, masks, least=0.9)
     half_round = [replace(frame, depth_m=frame.depth_m[::-1, ::-1]) for frame in frames]  # hung upside down
@@ -240,7 +241,9 @@ def test_a_camera_that_goes_round_is_not_taken_for_noisy_depth(rng, step_deg):
         for k in range(12)
     ]
     frames = [replace(frame, depth_m=frame.depth_m + np.float32(0.02 * k)) for k, frame in enumerate(frames)]
-    assert not Segmenter().scene(frames).still
+    scene = Segmenter().scene(frames)
+    assert scene.camera_moves
+    assert not scene.still
 
 
 def island(k, rng, *, plate):

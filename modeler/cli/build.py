@@ -103,6 +103,11 @@ class Build:
             say(f"{', '.join(changes)} since the run: frames are registered with them, from what is kept of it")
         compile_kernels(say)
         scene, _ = in_parallel(partial(compose.scene, modeler, whole), load)
+        if scene.camera_moves:
+            say(
+                "the camera seems to move: what stands at the middle of each image is taken for the object; give "
+                "masks, --roi or --max-depth-m where that is something else"
+            )
         with locked(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
             folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)

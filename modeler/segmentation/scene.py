@@ -77,6 +77,8 @@ class Scene:
     """Whether object and support plane are unambiguous."""
     still: bool = False
     """Whether camera and background are static, so that the scene holds for other frames."""
+    camera_moves: bool = False
+    """Whether so much changes from frame to frame that the camera itself must move."""
     alone: bool = False
     """Whether the frames show nothing but the object."""
     noise: DepthNoise | None = None

@@ -156,11 +156,11 @@ class Segmenter:
         if layers.changes_widely:
             factor = noise_ratio(depths_m, camera, noise)
             if factor > _NOISIEST:
-                return Scene()
+                return Scene(camera_moves=True)
             noisier = noise = noise.times(factor)
             layers = separate_layers(depths_m, camera, noise)
         if layers.camera_moves:
-            return Scene()
+            return Scene(camera_moves=True)
         stride = planning_stride(camera)
         allowed = self._allowed(layers.front_m[..., 2], stride)
         scene = learn(layers, allowed, noise, least_points=self.min_points / stride**2)
