@@ -175,7 +175,7 @@ class Tracker:
             if followed is not None:
                 return followed
         views = [self._view(replace(clear, mask=mask)) for mask in self.finder.masks(clear, self.renderer)]
-        return self._found([view for view in views if view is not None], rng, nothing)
+        return self._found([view for view in views if view is not None], rng, nothing, clear)
 
     @property
     def _follows(self) -> bool:
@@ -229,13 +229,20 @@ class Tracker:
         step = se3.log(se3.inverse(before @ about) @ poses[-1] @ about)
         return poses[-1] @ about @ se3.exp(pace * step) @ se3.inverse(about)
 
-    def _found(self, views: Sequence[RayImage], rng: np.random.Generator, nothing: Tracked | None = None) -> Tracked:
+    def _found(
+        self,
+        views: Sequence[RayImage],
+        rng: np.random.Generator,
+        nothing: Tracked | None = None,
+        unmasked: Frame | None = None,
+    ) -> Tracked:
         """Return the object with any rotation.
 
         Args:
             views: of the frame, each with another mask.
             rng: source of all randomness.
             nothing: what is returned without any view.
+            unmasked: the frame, if masks are guesses.
         """
         rough = []
         for view in views:
@@ -246,15 +253,20 @@ class Tracker:
         rough.sort(key=lambda one: -one[0])
         absent = nothing
         for _, poses, view in rough[:_MOST_TRIED]:
-            found = self._in_view(view, poses, rng)
+            found = self._in_view(view, poses, rng, unmasked)
             if found.pose is not None:
                 return found
             absent = absent if absent is not None and absent.outcome == "not there" else found
         assert absent is not None
         return absent
 
-    def _in_view(self, view: RayImage, rough: Array, rng: np.random.Generator) -> Tracked:
-        """Return the object in a view, near one of rough poses (k, 4, 4), the likeliest first."""
+    def _in_view(
+        self, view: RayImage, rough: Array, rng: np.random.Generator, unmasked: Frame | None = None
+    ) -> Tracked:
+        """Return the object in a view, near one of rough poses (k, 4, 4), the likeliest first.
+
+        A guessed mask that has too much or too little gets a second chance, with what is near the pose found in it.
+        """
         absent = Tracked(view.index, view.frame.time_s, "not there", reason="no view of the model fits", view=view)
         poses, scores = self.search.again(self.renderer, rough, view, self.sensor, rng)
         if not len(poses):
@@ -263,7 +275,12 @@ class Tracker:
         registered = [(self._registered(view, pose, rng), pose) for pose in likely]
         convincing = [(posterior, pose) for posterior, pose in registered if posterior.convincing]
         if not convincing:
-            best = registered[0][0]
+            best, about = registered[0]
+            if unmasked is not None and best.usable and best.overlap > _OVERLAP:
+                reached = se3.inverse(best.pose.mean) @ about
+                better = self._view(replace(unmasked, mask=self.finder.near(unmasked, reached, self.renderer)))
+                if better is not None:
+                    return self._in_view(better, reached[None], rng)
             reason = "the images contradict the likeliest pose" if best.usable else best.outcome.label
             return replace(absent, overlap=best.overlap, reason=reason)
         pairs = [self._pair(view, se3.inverse(posterior.pose.mean) @ pose, rng) for posterior, pose in convincing]
