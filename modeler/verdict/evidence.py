@@ -307,8 +307,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
 
 def _facing(view: RayImage) -> tuple[Array, Array, np.ndarray]:
     """Return surface points (n, 3) of a view that face its camera, away from its outline, normals (n, 3) and pixels."""
-    mask = view.frame.mask
-    assert mask is not None  # a view's frame is segmented
+    mask = np.isfinite(view.frame.depth_m) if view.frame.mask is None else view.frame.mask
     inner = ndimage.minimum_filter(mask, size=2 * _MARGIN_PX + 1, mode="nearest")[view.pixels[:, 0], view.pixels[:, 1]]
     some = np.flatnonzero(inner)[:: max(np.count_nonzero(inner) // MAX_POINTS, 1)]
     some = some[_face_camera(view.points_m[some], view.normals[some])]
