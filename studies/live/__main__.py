@@ -70,7 +70,9 @@ def followed(shape: str) -> int:
     with tempfile.TemporaryDirectory() as place:
         stream = open_stream(shape, save=Path(place) / "recording.rrd")
         folder, meta = RunFolder.open(Path(place) / "run"), RunMeta(shape, 0, "velocity")
-        with in_background(stream, lambda step: not step.last, share=DRAWING_SHARE) as draw:
+        with in_background(
+            stream, lambda event: not (isinstance(event, Step) and event.last), share=DRAWING_SHARE
+        ) as draw:
             began_s = time.monotonic()
             for event in run.track(newest, live=True):
                 if isinstance(event, Step):

@@ -16,9 +16,7 @@ Chosen = Callable[[tuple[int, ...]], tuple[int, ...]]
 """Returns the frame numbers of the capture in the order in which they are shown."""
 Change = Callable[[Frame, np.random.Generator], Frame]
 """Returns a frame changed."""
-QUARTER_TURN: Final = np.array(
-    [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
+QUARTER_TURN: Final = ((0.0, -1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 """Rows of turned_from_camera (4, 4) of an image rotated clockwise by 90°."""
 
 
