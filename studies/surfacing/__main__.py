@@ -19,13 +19,14 @@ import numpy as np
 
 from modeler import se3, sequences
 from modeler.cli import main as modeler
-from modeler.evaluation import TrueSurface, align_to_model, surface_errors
+from modeler.evaluation import SAMPLES, TrueSurface, align_to_model, sample_surface, surface_errors
 from modeler.export import write_atomically
 from modeler.fusion import Fuser
 from modeler.runs.reopening import reopened
 from modeler.sequences import true_mesh
 from modeler.types import Array, RayImage
 from studies.surfacing.cost import measured
+from studies.surfacing.drawing import Scene
 from studies.surfacing.methods import METHODS, Surface
 
 SHAPES = ("box", "flashlight", "tube", "bottle", "figurine", "l_bracket", "mug", "teapot")
@@ -94,11 +95,20 @@ def _rows(name: str, folder: Path) -> list[dict[str, object]]:
                     "f_5mm": errors.f_score(5e-3),
                     "accuracy_mm": 1e3 * errors.accuracy_m,
                     "completeness_mm": 1e3 * errors.completeness_m,
+                    "angle_deg": _angle_deg(made, (surface.vertices_m, surface.triangles)),
+                    "triangles": len(made[1]),
                     "ms_a_frame": 1e3 * seconds / len(run.views),
                     "mb_a_frame": megabytes / len(run.views),
                 }
             )
     return rows
+
+
+def _angle_deg(made: Surface, true: Surface) -> float:
+    """Return the median angle between normals of a surface and of the true one, over its area."""
+    points_m = sample_surface(*made, SAMPLES, np.random.default_rng([0, 2]))
+    one, other = (Scene(*surface).nearest_normals(points_m) for surface in (made, true))
+    return float(np.degrees(np.median(np.arccos(np.clip(np.sum(one * other, axis=1), -1.0, 1.0)))))
 
 
 def _made(
@@ -110,13 +120,13 @@ def _made(
 
 
 def _table(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return the results as a Markdown table: F at 3 mm and accuracy, time and memory a frame with true poses."""
+    """Return a Markdown table: F at 3 mm, accuracy and normals, time and memory a frame with true poses."""
     lines = ["| |" + "".join(f" {poses} poses: {method} |" for poses in ("true", "own") for method in METHODS)]
     lines[0] += " time, memory a frame: ours | their ratio to Open3D TSDF |"
     lines.append("|---" * (2 * len(METHODS) + 3) + "|")
     for shape in dict.fromkeys(str(row["shape"]) for row in rows):
         by = {(row["poses"], row["method"]): row for row in rows if row["shape"] == shape}
-        cells = [f"{by[key]['f_3mm']:.3f}, {by[key]['accuracy_mm']:.2f} mm" for key in by]
+        cells = [f"{by[key]['f_3mm']:.3f}, {by[key]['accuracy_mm']:.2f} mm, {by[key]['angle_deg']:.1f}°" for key in by]
         us, them = ([float(str(by["true", m][k])) for k in ("ms_a_frame", "mb_a_frame")] for m in list(METHODS)[:2])
         cells += [f"{us[0]:.0f} ms, {us[1]:.1f} MB", f"{us[0] / them[0]:.1f}, {us[1] / max(them[1], 1e-3):.1f}"]
         lines.append(f"| {shape} | " + " | ".join(cells) + " |")

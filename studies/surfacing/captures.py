@@ -3,9 +3,10 @@
 Cross-validation over the views of a run: each fold leaves out every FOLDS-th view, fuses the rest with the run's poses,
 and compares the mesh with each left-out view. Prints a Markdown table, a row for each run and method: the share of the
 object's pixels that violate free space, the share of surface observed by other views too that is missing, the distance
-of surfaces, colour differences (of our textures, of 255, one gain for the view; as they are, and with the shading of
-the view's lamps put back), gradient differences per pixel (seams that are not in the images, blurred print); and for
-the mesh of all views the length of its boundaries, and false surface on the support.
+of surfaces and the angle between their normals, colour differences (of our textures, of 255, one gain for the view; as
+they are, and with the shading of the view's lamps put back), gradient differences per pixel (seams that are not in the
+images, blurred print); and for the mesh of all views its triangles, the length of its boundaries, and false surface on
+the support.
 """
 
 from __future__ import annotations
@@ -59,19 +60,20 @@ def poisson(volume: FusionVolume, views: Mapping[int, RayImage], poses: Mapping[
 METHODS: dict[str, Method] = {"ours": ours, "Open3D TSDF": tsdf, "Open3D Poisson": poisson}
 
 
-def figures_of(run: Reopened, method: str, folds: int) -> dict[str, float]:
-    """Return the means of all figures over a run's views, each left out once."""
+def figures_of(run: Reopened, method: str, folds: int, measured: int) -> dict[str, float]:
+    """Return the means of all figures over a run's views, each of the first `measured` folds left out once."""
     whole, rows = run.volume(Fuser()), []
     poses = run.solution.trajectory
     frames = sorted(frame for frame in run.views if frame in poses)
-    for fold in range(min(folds, len(frames))):
+    for fold in range(min(folds, measured, len(frames))):
         out = frames[fold::folds]
         rest = {frame: run.views[frame] for frame in frames if frame not in out}
         volume = replace(run, views=rest).volume(Fuser())
         mesh = METHODS[method](volume, rest, poses)
         rows += [compared(mesh, volume, run.views[frame], poses[frame], whole.near_m) for frame in out]
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    return means | tidiness(METHODS[method](whole, run.views, poses), run, whole)
+    mesh = METHODS[method](whole, run.views, poses)
+    return means | {"triangles": len(mesh[1])} | tidiness(mesh, run, whole)
 
 
 def compared(
@@ -88,10 +90,14 @@ def compared(
     beyond_m = drawn.depth_m[here] - view.points_m[:, 2]
     seen = volume.support(points_m, normals).views > 0
     same = np.abs(beyond_m) < 2.0 * near_m
+    corners = mesh[0][mesh[1][drawn.triangle[here][same]]]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cosines = np.sum(across * normals[same], axis=1) / np.maximum(np.linalg.norm(across, axis=1), 1e-30)
     figures = {
         "through": float(np.count_nonzero(through)) / max(1, np.count_nonzero(mask)),
         "missing": float(np.mean(beyond_m[seen] > 2.0 * near_m)),
         "apart_mm": 1e3 * float(np.median(np.abs(beyond_m[same]))),
+        "angle_deg": float(np.median(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))))),
     }
     if frame.colour is None:
         return figures
@@ -143,13 +149,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--folds", type=int, default=FOLDS)
+    parser.add_argument("--measured", type=int, default=FOLDS, metavar="N", help="leave out only the first N folds")
     parser.add_argument("--out", type=Path, default=None, help="JSON to write")
     options = parser.parse_args(arguments)
     rows = []
     for folder in options.runs:
         run = reopened(folder)
         for method in options.methods:
-            rows.append({"run": folder.name, "method": method, **figures_of(run, method, options.folds)})
+            rows.append(
+                {"run": folder.name, "method": method, **figures_of(run, method, options.folds, options.measured)}
+            )
             print(json.dumps(rows[-1]), file=sys.stderr)
     if options.out is not None:
         write_atomically(options.out, json.dumps(rows, indent=1) + "\n")
@@ -162,6 +171,8 @@ def _table(rows: Sequence[Mapping[str, object]]) -> str:
         "free-space violations",
         "missing",
         "distance",
+        "normals",
+        "triangles",
         "colour",
         "same, lit",
         "gradient",
@@ -173,6 +184,8 @@ def _table(rows: Sequence[Mapping[str, object]]) -> str:
         "through": "{:.2%}",
         "missing": "{:.2%}",
         "apart_mm": "{:.2f} mm",
+        "angle_deg": "{:.1f}°",
+        "triangles": "{:.0f}",
         "colour": "{:.1f}",
         "colour_lit": "{:.1f}",
         "gradient_lit": "{:.1f}",

@@ -64,6 +64,11 @@ class Scene:
             np.stack([1.0 - second - third, second, third], axis=-1),
         )
 
+    def nearest_normals(self, points_m: Array) -> Array:
+        """Return the unit normals (n, 3) of the mesh at the places nearest to points (n, 3)."""
+        found = self._scene.compute_closest_points(o3d.core.Tensor.from_numpy(points_m.astype(np.float32)), nthreads=1)
+        return found["primitive_normals"].numpy().astype(np.float64)
+
     def of(self, drawn: Drawn, values: Array) -> Array:
         """Return values (v, c) of vertices where the mesh is hit, (n, c)."""
         corners = self.triangles[drawn.triangle[drawn.hit]]
