@@ -179,6 +179,25 @@ def test_flat_gets_flat_edges_stay_and_no_vertex_moves_beyond_its_limit(rng: np.
     assert np.median(np.arccos(np.clip(np.sum(normals * true, axis=1), -1.0, 1.0))) < np.radians(2.0)
 
 
+def test_rounded_surface_gets_smooth_not_faceted(rng: np.random.Generator) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    bumps = np.zeros(len(ball.vertices))
+    for _ in range(40):
+        bumps += np.cos(ball.vertices @ rng.normal(0.0, 2.0 * np.pi / 0.02, 3) + rng.uniform(0.0, 2.0 * np.pi))
+    vertices_m = ball.vertices * (1.0 + 2e-4 / 0.05 * bumps / bumps.std())[:, None]
+    smooth_m = meshing.without_relief(vertices_m, ball.faces, np.full(len(vertices_m), 4e-4))
+
+    def errors_deg(of_m: Array) -> Array:
+        cosines = np.sum(meshing.normals_of(of_m, ball.faces) * ball.vertices / 0.05, axis=1)
+        return np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+
+    assert np.median(errors_deg(smooth_m)) < 0.4 * np.median(errors_deg(vertices_m))
+    assert np.quantile(errors_deg(smooth_m), 0.95) < 0.5 * np.quantile(errors_deg(vertices_m), 0.95)
+    assert np.std(np.linalg.norm(smooth_m, axis=1)) < 2e-4
+    turns = trimesh.Trimesh(smooth_m, ball.faces, process=False).face_adjacency_angles
+    assert np.quantile(turns, 0.99) < 4.0 * np.median(turns)
+
+
 def test_smoothing_moves_with_the_mesh_and_leaves_what_is_sure_or_smooth(rng: np.random.Generator) -> None:
     vertices_m, edge_m = bumpy_cube(rng)
     limits_m = np.where(edge_m > 0.02, 2e-4, 0.0)

@@ -143,6 +143,7 @@ WEAK = 0.2  # vertices with less than this share of the median support are weak
 WEAK_PASSES = 40  # of smoothing weak vertices
 PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxels
 EDGE = 4.685  # sd of the differences between neighbouring normals that make an edge: Tukey's, of 95 % efficiency
+GUIDE_PASSES = 10  # of smoothing normals before edges are sought
 DIFFUSION_PASSES = 200  # of normals over neighbouring triangles: some 15 triangles far
 FITTING_PASSES = 60  # of vertices to normals
 
@@ -336,11 +337,12 @@ def without_relief(vertices_m: Array, triangles: Triangles, limits_m: Array) -> 
     if not len(first):
         return vertices_m
     normals, areas = relief.facets(vertices_m, triangles)
-    turns = np.linalg.norm(normals[first] - normals[across[first, side]], axis=1)
+    guide = relief.diffused(normals, normals, areas, across, np.inf, GUIDE_PASSES)
+    turns = np.linalg.norm(guide[first] - guide[across[first, side]], axis=1)
     sigma = float(np.median(turns)) / RAYLEIGH_MEDIAN
     if not sigma > 0.0:
         return vertices_m
-    normals = relief.diffused(normals, areas, across, EDGE * sigma, DIFFUSION_PASSES)
+    normals = relief.diffused(normals, guide, areas, across, EDGE * sigma, DIFFUSION_PASSES)
     return relief.fitted(vertices_m, triangles, normals, limits_m, FITTING_PASSES)
 
 

@@ -26,16 +26,18 @@ def facets(vertices, triangles):
 
 
 @njit(cache=True, nogil=True)
-def diffused(normals, areas, neighbours, edge, passes):
+def diffused(normals, guide, areas, neighbours, edge, passes):
     """Return unit normals (t, 3) after robust anisotropic diffusion (Black et al. 1998; eq. 12.13).
 
-    In each pass, a normal becomes the mean of itself and its neighbours' by area and Tukey's biweight.
+    In each pass, a normal becomes the mean of itself and its neighbours' by area and Tukey's biweight of the difference
+    between the two in smoother normals, without which rounded surface becomes faceted (Catté et al. 1992).
 
     Args:
         normals: (t, 3) unit.
+        guide: (t, 3) unit, in which edges are found.
         areas: (t,).
         neighbours: (t, 3) triangles across the edges, -1 = none.
-        edge: length of a difference between normals across which nothing diffuses.
+        edge: length of a difference in the guide across which nothing diffuses.
         passes: number of passes.
     """
     normals, after = normals.copy(), np.empty_like(normals)
@@ -47,9 +49,9 @@ def diffused(normals, areas, neighbours, edge, passes):
                 if g < 0:
                     continue
                 share = (
-                    (normals[f, 0] - normals[g, 0]) ** 2
-                    + (normals[f, 1] - normals[g, 1]) ** 2
-                    + (normals[f, 2] - normals[g, 2]) ** 2
+                    (guide[f, 0] - guide[g, 0]) ** 2
+                    + (guide[f, 1] - guide[g, 1]) ** 2
+                    + (guide[f, 2] - guide[g, 2]) ** 2
                 ) / (edge * edge)
                 if share < 1.0:
                     weight = areas[g] * (1.0 - share) ** 2
