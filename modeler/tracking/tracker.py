@@ -160,13 +160,13 @@ class Tracker:
         return found
 
     def _placed(self, frame: Frame, rng: np.random.Generator) -> Tracked:
-        """Return the object in a frame: in its mask, in what the scene shows to move, or anywhere."""
+        """Return the object in a frame: in its mask, in what the scene shows to move, or if nothing does, anywhere."""
         nothing = Tracked(frame.index, frame.time_s, "too few points", reason="no segment is large enough")
         segmented = frame.mask is not None or self.scene.still or self.scene.alone
         if segmented:
             view = self._view(frame)
             found = nothing if view is None else self._followed(view, rng) or self._found([view], rng)
-            if found.pose is not None or frame.mask is not None:
+            if view is not None or frame.mask is not None:
                 return found
         clear = frame.unoccluded
         if self._follows:
