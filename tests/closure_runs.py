@@ -108,7 +108,7 @@ def witnessed(posterior: Posterior, nats: float) -> Posterior:
     return replace(posterior, log_marginal_likelihood=nats)
 
 
-def told(source: int, *, scatter: float = 4.0, wrong: float = -90.0) -> Callable[[Posterior], Posterior]:
+def stated(source: int, *, scatter: float = 4.0, wrong: float = -90.0) -> Callable[[Posterior], Posterior]:
     """Give evidence to registrations: as edges have it, and to those over more than one step from `source` far less."""
 
     def given(posterior: Posterior) -> Posterior:

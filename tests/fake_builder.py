@@ -39,8 +39,8 @@ def sequence(folder: Path, *, pairs: int = 3, status: int = 0, pause_s: float = 
         fails: how often the build is killed before.
     """
     folder.mkdir(parents=True)
-    told = {"pairs": pairs, "status": status, "pause_s": pause_s, "fails": fails}
-    (folder / "told.json").write_text(json.dumps(told))
+    given = {"pairs": pairs, "status": status, "pause_s": pause_s, "fails": fails}
+    (folder / "given.json").write_text(json.dumps(given))
     return folder
 
 
@@ -65,26 +65,26 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 
 def build(job: Job) -> int:
-    told = json.loads((Path(job.sequence) / "told.json").read_text())
+    given = json.loads((Path(job.sequence) / "given.json").read_text())
     (job.run / ".pairs").mkdir(parents=True, exist_ok=True)
-    for pair in range(told["pairs"]):
+    for pair in range(given["pairs"]):
         kept = job.run / ".pairs" / f"{pair}"
         if kept.exists():
             continue
         with open(Path(job.out) / BOOK, "a") as lines:
             lines.write(f"{job.name} {pair} {os.getpid()}\n")
-        time.sleep(told["pause_s"])
+        time.sleep(given["pause_s"])
         kept.touch()
     failed = job.run / "failed"
     failures = len(failed.read_text()) if failed.exists() else 0
-    if failures < told["fails"]:
+    if failures < given["fails"]:
         failed.write_text("x" * (failures + 1))
         os.abort()
-    if told["status"] in ENDED:
+    if given["status"] in ENDED:
         (job.run / "report.json").write_text("{}")
     else:
         print(f"modeler: {job.sequence}: cannot be built", file=sys.stderr)
-    return told["status"]
+    return given["status"]
 
 
 def main() -> int:

@@ -126,7 +126,7 @@ def hand(camera: Array) -> tuple[Array, Array]:
     return np.arange(5.0) * 0.5, np.array([camera @ turned((k - 2) * STEP) @ grip for k in range(5)])
 
 
-def told(direction: Array) -> tuple[float, float, float]:
+def stated(direction: Array) -> tuple[float, float, float]:
     """Three numbers as an option has them."""
     x, y, z = direction.tolist()
     return x, y, z
@@ -137,7 +137,7 @@ class Case:
     """One prior to be held to the contract."""
 
     prior: Callable[[Array], AbstractPrior]
-    """The prior, told of the scene as the camera (4, 4, from the scene's own) sees it."""
+    """The prior, given the scene as the camera (4, 4, from the scene's own) sees it."""
     table: bool = True
     """Whether the views show their table."""
     proposes: bool = False
@@ -153,7 +153,7 @@ class Case:
 
 def turntable(camera: Array, **given: object) -> TurntablePrior:
     """A turntable whose axis is given in direction, and as the keywords say."""
-    prior = TurntablePrior(24.0, 2.0, axis_direction=told(camera[:3, :3] @ NORMAL))
+    prior = TurntablePrior(24.0, 2.0, axis_direction=stated(camera[:3, :3] @ NORMAL))
     return replace(prior, **given)  # pyright: ignore[reportArgumentType]
 
 
@@ -165,7 +165,7 @@ def held(camera: Array) -> HeldPrior:
 def poke(camera: Array) -> PokePrior:
     """A push that brings the object from the earlier view about to the later."""
     point_m = se3.transform(camera, np.array([[0.05, 0.02, 0.8]]))[0]
-    return PokePrior(Poke(told(point_m), told(camera[:3, :3] @ np.array([0.2, 0.6, -0.8])), 0.03))
+    return PokePrior(Poke(stated(point_m), stated(camera[:3, :3] @ np.array([0.2, 0.6, -0.8])), 0.03))
 
 
 def velocity(camera: Array) -> AbstractPrior:
@@ -191,7 +191,7 @@ CASES: dict[str, Case] = {
     "turntable on its table": Case(lambda _: TurntablePrior(24.0, 2.0, needs_table=True)),
     "turntable either way": Case(lambda camera: turntable(camera, step_sign="unknown")),
     "turntable at a point": Case(
-        lambda camera: turntable(camera, axis_point_m=told(se3.transform(camera, AXIS_POINT_M[None])[0]))
+        lambda camera: turntable(camera, axis_point_m=stated(se3.transform(camera, AXIS_POINT_M[None])[0]))
     ),
     "turntable of rough axis": Case(lambda camera: turntable(camera, axis_sigma_deg=30.0), table=False),
     "turntable of any axis": Case(lambda camera: turntable(camera, axis_sigma_deg=180.0), table=False),

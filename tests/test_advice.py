@@ -153,9 +153,9 @@ def test_messages_name_parameters_and_options_that_exist() -> None:
         if path.name in ("messages.py", "viewer.py"):  # options of all commands, and those of Rerun
             continue
         tree = ast.parse(path.read_text())
-        told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        given = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
         for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told:
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in given:
                 named = re.findall(r"`(\w+)`", node.value)
                 named += re.findall(r"(?<![\w-])--([a-z][a-z0-9-]+)", node.value)
                 unknown |= {(path.name, name) for name in named if name.replace("_", "-") not in options}

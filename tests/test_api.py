@@ -129,7 +129,7 @@ def taken(order: list[str]) -> Iterator[Frame]:
         yield frame
 
 
-def told(order: list[str]) -> Callable[[Event], None]:
+def stated(order: list[str]) -> Callable[[Event], None]:
     return lambda event: order.append(f"step {event.frame.index}") if isinstance(event, Step) else None
 
 
@@ -153,7 +153,7 @@ def test_frames_of_a_generator_become_a_run_folder_with_a_verdict(tmp_path: Path
 def test_a_live_loop_is_asked_for_a_frame_once_the_one_before_is_processed() -> None:
     live, read = list[str](), list[str]()
     for order, flag in ((live, True), (read, False)):
-        modeler.build(taken(order), prior="general", registrar=KNOWN, sinks=[told(order)], live=flag)
+        modeler.build(taken(order), prior="general", registrar=KNOWN, sinks=[stated(order)], live=flag)
     assert live == [
         *("taken 0", "taken 1", "taken 2"),  # from which the scene is learned
         *("step 0", "step 1", "step 2", "taken 3", "step 3", "step 3"),

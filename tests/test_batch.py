@@ -48,18 +48,18 @@ def test_each_sequence_is_built_once_and_its_status_is_kept(cli: Run, tmp_path: 
     assert f"{worse}: cannot be built" in ended.err
     assert "1 of 3 models can be trusted, 1 cannot, 1 sequence failed" in ended.err
     assert Counter(book(out)) == Counter([(name, pair) for name in ("good", "bad", "worse") for pair in range(3)])
-    told = rows(out)
-    assert {name: row["status"] for name, row in told.items()} == {"good": 0, "bad": 3, "worse": 2}
-    assert [told[name]["tries"] for name in ("good", "bad", "worse")] == [0, 0, 2]
-    assert told["bad"]["reasons"] == ["made up"]
-    assert told["worse"]["failure"] == f"{worse}: cannot be built"
-    assert told["good"]["sequence"] == str(good)
+    stated = rows(out)
+    assert {name: row["status"] for name, row in stated.items()} == {"good": 0, "bad": 3, "worse": 2}
+    assert [stated[name]["tries"] for name in ("good", "bad", "worse")] == [0, 0, 2]
+    assert stated["bad"]["reasons"] == ["made up"]
+    assert stated["worse"]["failure"] == f"{worse}: cannot be built"
+    assert stated["good"]["sequence"] == str(good)
     before = len(book(out))
     again = cli("batch", good, bad, worse, "--out", out)
     assert again.status == 3
     assert "2 done, 1 failed twice, 0 to be resumed, 0 to be built" in again.err
     assert len(book(out)) == before
-    assert rows(out) == told
+    assert rows(out) == stated
     assert cli("batch", good, "--out", out).status == 0
 
 
@@ -129,10 +129,10 @@ def test_models_are_built_anew_only_where_that_is_asked_for(cli: Run, tmp_path: 
         ended = cli("batch", folder, other, "--out", out, *change)
         assert (ended.status, ended.err.count("\n")) == (2, 1)
         assert "--overwrite" in ended.err
-    os.utime(folder / "told.json", (1, 1))
+    os.utime(folder / "given.json", (1, 1))
     assert cli("batch", folder, other, "--out", out).status == 0
     assert len(book(out)) == 6
-    (folder / "told.json").write_text((folder / "told.json").read_text() + " ")
+    (folder / "given.json").write_text((folder / "given.json").read_text() + " ")
     assert cli("batch", folder, other, "--out", out).status == 2
     assert len(book(out)) == 6
     assert cli("batch", folder, other, "--out", out, "--overwrite").status == 0
@@ -238,7 +238,7 @@ def test_options_that_cannot_be_used_are_refused_in_a_line(cli: Run, tmp_path: P
         assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1), options
     assert cli("batch", folder, "--out", folder / "out").status == 2
     assert cli("batch", folder, "--out", folder).status == 2
-    assert sorted(path.name for path in folder.iterdir()) == ["told.json"]
+    assert sorted(path.name for path in folder.iterdir()) == ["given.json"]
 
 
 def test_an_executor_of_ones_own_is_a_callable(cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -325,14 +325,14 @@ def test_who_works_on_a_sequence_is_waited_for(tmp_path: Path) -> None:
     assert book(tmp_path / "out") == [("s", pair) for pair in range(5)]
 
 
-def test_the_input_is_told_by_its_content(tmp_path: Path) -> None:
+def test_the_input_is_recognised_by_its_content(tmp_path: Path) -> None:
     folder = sequence(tmp_path / "s")
     (folder / "circle").symlink_to(folder)
     calibration = tmp_path / "noise.json"
     calibration.write_text("1")
     job = Job("s", str(folder), str(tmp_path), ("--sensor", str(calibration)))
     contents = [fingerprint(job, content=True)]
-    os.utime(folder / "told.json", (1, 1))
+    os.utime(folder / "given.json", (1, 1))
     assert fingerprint(job, content=True) == contents[0]
     for change in (
         lambda: calibration.write_text("2"),

@@ -140,7 +140,7 @@ def test_a_reader_who_has_left_is_no_error(arguments: tuple[str, ...]) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 @pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("info", BOX)])
-def test_a_full_disk_under_stdout_is_told_in_one_line(arguments: tuple[str, ...]) -> None:
+def test_a_full_disk_under_stdout_is_reported_in_one_line(arguments: tuple[str, ...]) -> None:
     command = [sys.executable, "-m", "modeler", *arguments]
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
@@ -166,13 +166,13 @@ def test_register_prints_one_edge_the_same_for_the_same_seed(cli: Run) -> None:
     assert cli("register", BOX, "1", "0", "--prior", "table", "--seed", "6").out != ended.out
 
 
-def test_the_sequence_says_what_is_known_and_the_user_is_told(cli: Run, tmp_path: Path) -> None:
-    told = cli("register", BOX, "1", "0", "--method", "icp")
-    assert told.status == 0
-    assert "prior table" in told.err
-    assert told.out == cli("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
-    told = cli("register", BOX, "1", "0", "--method", "icp", "--prior", "turntable")
-    assert "step 25°" in told.err
+def test_the_sequence_says_what_is_known_and_the_user_is_informed(cli: Run, tmp_path: Path) -> None:
+    given = cli("register", BOX, "1", "0", "--method", "icp")
+    assert given.status == 0
+    assert "prior table" in given.err
+    assert given.out == cli("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
+    given = cli("register", BOX, "1", "0", "--method", "icp", "--prior", "turntable")
+    assert "step 25°" in given.err
     ended = cli("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
     assert ended.err.startswith("modeler: prior table")
     assert report(tmp_path / "run")["prior"] == "table"
@@ -187,17 +187,17 @@ def test_register_gives_the_edge_that_build_finds(cli: Run, built: Path) -> None
 
 def test_build_fills_a_run_folder(built: Path) -> None:
     assert {path.name for path in built.iterdir()} == FILES
-    told = report(built)
-    assert (told["schema"], told["seed"], told["prior"]) == (2, 0, "table")
-    assert told["settings"] == {"method": "visibility", "colour": True, "voxel_m": 0.004, "every": 1, "frames": "0:3"}
-    assert (told["complete"], told["trustworthy"], told["reasons"]) == (True, True, [])
-    assert [(frame["id"], frame["outcome"]) for frame in told["frames"]] == [(k, "accepted") for k in range(3)]
-    edges = {(edge["source"], edge["target"]): edge["accepted"] for edge in told["edges"]}
+    given = report(built)
+    assert (given["schema"], given["seed"], given["prior"]) == (2, 0, "table")
+    assert given["settings"] == {"method": "visibility", "colour": True, "voxel_m": 0.004, "every": 1, "frames": "0:3"}
+    assert (given["complete"], given["trustworthy"], given["reasons"]) == (True, True, [])
+    assert [(frame["id"], frame["outcome"]) for frame in given["frames"]] == [(k, "accepted") for k in range(3)]
+    edges = {(edge["source"], edge["target"]): edge["accepted"] for edge in given["edges"]}
     assert {(1, 0), (2, 1)} <= set(edges)
     assert all(edges.values())
-    poses = np.array([pose["object_from_camera"] for pose in told["poses"]]).reshape(-1, 4, 4)
+    poses = np.array([pose["object_from_camera"] for pose in given["poses"]]).reshape(-1, 4, 4)
     assert np.allclose(poses[0], np.eye(4), atol=1e-9)
-    assert told["seconds"]["total"] > told["seconds"]["registration"] > 0.0
+    assert given["seconds"]["total"] > given["seconds"]["registration"] > 0.0
     assert len((built / "trajectory.txt").read_text().splitlines()) == 3
     mesh = trimesh.load_mesh(built / "model.ply")
     assert 0.1 < np.linalg.norm(mesh.extents) < 0.6
@@ -230,11 +230,13 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(cli: Run, tmp_p
     ended = cli("build", BOX, "--out", tmp_path, *QUICK, "--max-depth-m", "0.1")
     assert (ended.status, ended.out) == (3, "")
     assert f"frame 0 is left out: {Outcome.TOO_FEW_POINTS.label}" in ended.err
-    told = report(tmp_path)
-    assert not told["trustworthy"]
-    assert told["complete"]
-    assert [frame["outcome"].partition(":")[0] for frame in told["frames"]] == [Outcome.TOO_FEW_POINTS.label] * 3
-    (lost,) = (reason for code, reason in zip(told["reason_codes"], told["reasons"], strict=True) if code == "left_out")
+    given = report(tmp_path)
+    assert not given["trustworthy"]
+    assert given["complete"]
+    assert [frame["outcome"].partition(":")[0] for frame in given["frames"]] == [Outcome.TOO_FEW_POINTS.label] * 3
+    (lost,) = (
+        reason for code, reason in zip(given["reason_codes"], given["reasons"], strict=True) if code == "left_out"
+    )
     assert lost.startswith("frames 0 to 2 ")
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
 
@@ -321,7 +323,7 @@ def test_a_rendered_sequence_can_be_opened(cli: Run, tmp_path: Path) -> None:
 # What `build` remarks on at its end, and how Ctrl-C brings that about.
 
 
-def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_frames() -> None:
+def test_a_step_between_numbers_that_leave_some_out_is_reported_as_a_step_between_frames() -> None:
     options, whole = PriorOptions(prior="turntable", step_deg=-10.0), open_sequence(BOX)
     assert compose.resolved_prior(options, whole) == ("turntable", "")
     _, remark = compose.resolved_prior(options, whole.select(every=3))
@@ -339,12 +341,12 @@ def test_a_step_between_numbers_that_leave_some_out_is_told_as_a_step_between_fr
         (slice(0, 8), 25.0, False),
     ],
 )
-def test_a_turn_that_is_told_by_hand_counts_more(frames: slice, given_deg: float | None, *, expected: bool) -> None:
-    told = [priors.GeneralPrior()]
+def test_a_turn_that_is_given_by_hand_counts_more(frames: slice, given_deg: float | None, *, expected: bool) -> None:
+    given = [priors.GeneralPrior()]
     if given_deg is not None:
         table = priors.TurntablePrior(given_deg)
-        told = [table, priors.ProductPrior(priors.GeneralPrior(), table), priors.VelocityPrior(table)]
-    for prior in told:
+        given = [table, priors.ProductPrior(priors.GeneralPrior(), table), priors.VelocityPrior(table)]
+    for prior in given:
         assert comes_back(open_sequence(BOX).select(frames=frames), prior, reach_deg=20.0) is expected
 
 
@@ -357,7 +359,7 @@ def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
     assert not sign_in_doubt({"frames": [], "reason_codes": ["interrupted"]}, known)
 
 
-def test_a_step_that_the_views_contradict_is_told() -> None:
+def test_a_step_that_the_views_contradict_is_reported() -> None:
     def steps(turn_deg: float, count: int = 4, gap: int = 1) -> list[dict]:
         turn = se3.exp(np.array([0.0, np.radians(turn_deg), 0.0, 0.0, 0.0, 0.0]))
         edge = {"accepted": True, "kind": "odometry", "target_from_source": turn.ravel().tolist()}
@@ -380,7 +382,7 @@ def test_a_step_that_the_views_contradict_is_told() -> None:
     assert "turned by 15.0°" in measured_step(steps(15.0), priors.ProductPrior(priors.GeneralPrior(), prior))
 
 
-def test_frames_before_the_object_came_are_told() -> None:
+def test_frames_before_the_object_came_are_reported() -> None:
     few, lost = Outcome.TOO_FEW_POINTS.label, Outcome.NO_OVERLAP.label
 
     def said(*outcomes: str) -> str:
@@ -393,13 +395,13 @@ def test_frames_before_the_object_came_are_told() -> None:
         assert said(*whole) == ""
 
 
-@pytest.mark.parametrize(("hand", "told"), [(0, True), (1, True), (2, True), (3, False), (4, False)])
-def test_frames_without_a_hand_are_not_said_to_lack_the_object(hand: int, told: bool) -> None:
+@pytest.mark.parametrize(("hand", "given"), [(0, True), (1, True), (2, True), (3, False), (4, False)])
+def test_frames_without_a_hand_are_not_said_to_lack_the_object(hand: int, given: bool) -> None:
     """Where a hand is taken for the object, its masks are unsure, and nothing is found in the frames that lack it."""
     few = {"cause": Outcome.TOO_FEW_POINTS.label, "mask": Outcome.TOO_FEW_POINTS.label}
     masks = [Outcome.UNSURE_MASK] * hand + [Outcome.CONVERGED] * (4 - hand)
     frames = [few, *({"cause": "", "mask": mask.label} for mask in masks)]
-    assert bool(visible_frames([frame | {"id": place} for place, frame in enumerate(frames)])) is told
+    assert bool(visible_frames([frame | {"id": place} for place, frame in enumerate(frames)])) is given
 
 
 def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:

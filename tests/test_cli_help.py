@@ -95,10 +95,10 @@ sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
 
 
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PriorOptions) if field.name != "prior"])
-def test_defaults_told_in_help_are_those_of_the_priors(build_help: str, name: str) -> None:
+def test_defaults_stated_in_help_are_those_of_the_priors(build_help: str, name: str) -> None:
     words = " ".join(build_help.replace("│", " ").split())
-    told = re.search(rf"--{name.replace('_', '-')} .*?\(default: (\S+)\)", words)
-    assert told is not None
+    given = re.search(rf"--{name.replace('_', '-')} .*?\(default: (\S+)\)", words)
+    assert given is not None
     defaults = {
         field.default
         for prior in vars(priors).values()
@@ -106,11 +106,11 @@ def test_defaults_told_in_help_are_those_of_the_priors(build_help: str, name: st
         for field in dataclasses.fields(prior)
         if field.name == name and isinstance(field.default, float)
     }
-    numbers = {float(told[1])} if re.fullmatch(r"[0-9.]+", told[1]) and defaults else set()
+    numbers = {float(given[1])} if re.fullmatch(r"[0-9.]+", given[1]) and defaults else set()
     assert numbers == defaults
 
 
-def test_the_version_is_told(cli: Run) -> None:
+def test_the_version_is_reported(cli: Run) -> None:
     ended = cli("--version")
     assert (ended.status, ended.err) == (0, "")
     assert re.fullmatch(r"modeler \d+\.\d+\.\d+\n", ended.out)

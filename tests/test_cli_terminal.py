@@ -62,7 +62,7 @@ def test_where_stderr_is_no_terminal_there_is_no_bar(capfd: pytest.CaptureFixtur
     assert said.err == ""
 
 
-def told(outcomes: Iterable[tuple[int, Reason | None]], capfd: pytest.CaptureFixture[str]) -> list[str]:
+def given(outcomes: Iterable[tuple[int, Reason | None]], capfd: pytest.CaptureFixture[str]) -> list[str]:
     """Return the lines that are said of frames, by number, that end so."""
     frame = next(iter(open_sequence(bundled("tube"))))
     nothing = Segmentation(np.zeros_like(frame.depth_m, dtype=bool), None, FEW)
@@ -73,16 +73,16 @@ def told(outcomes: Iterable[tuple[int, Reason | None]], capfd: pytest.CaptureFix
     return capfd.readouterr().err.splitlines()
 
 
-def test_a_frame_left_out_is_told_once_and_so_is_that_it_was_placed(capfd: pytest.CaptureFixture[str]) -> None:
-    left_out, placed = told([(0, Failed(FEW)), (0, Failed(FEW)), (0, None)], capfd)
+def test_a_frame_left_out_is_reported_once_and_so_is_that_it_was_placed(capfd: pytest.CaptureFixture[str]) -> None:
+    left_out, placed = given([(0, Failed(FEW)), (0, Failed(FEW)), (0, None)], capfd)
     assert left_out.startswith(f"modeler: frame 0 is left out: {FEW.label}")
     assert placed.startswith("modeler: frame 0 is placed")
 
 
-def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_to_do_about_frames_left_out_is_reported_once(capfd: pytest.CaptureFixture[str]) -> None:
     unsure = Outcome.UNSURE_MASK
     refusals = [PriorRefused(f"frames {frame} and 2 show no plane; show it") for frame in (3, 4)]
-    said = told(enumerate([Failed(FEW), Failed(FEW), Failed(unsure), *refusals]), capfd)
+    said = given(enumerate([Failed(FEW), Failed(FEW), Failed(unsure), *refusals]), capfd)
     few, doubtful = (as_options(outcome_advice(outcome)) for outcome in (FEW, unsure))
     assert [(few in line, doubtful in line, "show it" in line) for line in said] == [
         (True, False, False), (False, False, False), (False, True, False), (False, False, True), (False, False, False)
@@ -92,9 +92,9 @@ def test_what_to_do_about_frames_left_out_is_told_once(capfd: pytest.CaptureFixt
     ] * 3
 
 
-def test_frames_that_are_left_out_in_a_row_are_told_together(capfd: pytest.CaptureFixture[str]) -> None:
+def test_frames_that_are_left_out_in_a_row_are_reported_together(capfd: pytest.CaptureFixture[str]) -> None:
     lost = Failed(FEW)
-    said = told(enumerate([None, *[lost] * 8, None, lost, lost]), capfd)
+    said = given(enumerate([None, *[lost] * 8, None, lost, lost]), capfd)
     assert [line.partition(" left out")[0] for line in said] == [
         *(f"modeler: frame {number} is" for number in (1, 2, 3, 4)),
         "modeler: frames 5 to 8 are",
@@ -136,11 +136,11 @@ with Console(25, None) as console:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
 @pytest.mark.parametrize(
-    ("events", "told"),
+    ("events", "given"),
     [("[Searching(12)]", "frame 12"), ("[Fusing(), *(Refining(done, 7) for done in range(8))]", "7/7")],
 )
-def test_a_terminal_sees_which_frame_is_tried_again_and_what_follows_the_last(events: str, told: str) -> None:
-    assert told in on_a_terminal([sys.executable, "-c", WATCHED.format(events)])
+def test_a_terminal_sees_which_frame_is_tried_again_and_what_follows_the_last(events: str, given: str) -> None:
+    assert given in on_a_terminal([sys.executable, "-c", WATCHED.format(events)])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
@@ -158,7 +158,7 @@ def test_a_terminal_sees_what_to_do_next_while_frames_come(scene: Path, tmp_path
     assert "next: turn by " in on_a_terminal([*COMMAND, "build", str(growing), *options])
 
 
-def test_nobody_is_told_where_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
+def test_nobody_is_informed_where_there_is_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
     with Console(25, None) as console:
         console(Searching(12))
     said = capfd.readouterr()

@@ -5,7 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from closure_runs import ABOUT_OBJECT, COVARIANCE, REGULAR_DEG, Run, judged, posterior_of, told, turned, view, witnessed
+from closure_runs import (
+    ABOUT_OBJECT,
+    COVARIANCE,
+    REGULAR_DEG,
+    Run,
+    judged,
+    posterior_of,
+    stated,
+    turned,
+    view,
+    witnessed,
+)
 
 from modeler import se3
 from modeler.closure import Closer, MapView
@@ -235,19 +246,19 @@ def test_closures_need_overlap_and_a_usable_outcome() -> None:
 
 def test_closure_that_the_images_contradict_is_refused_though_it_agrees() -> None:
     run = Run(list(REGULAR_DEG))
-    run.run(Closer(), told(13))
+    run.run(Closer(), stated(13))
     (closure,) = [edge for edge in run.judged[13] if edge.target == 0]
     assert not closure.accepted
     assert isinstance(closure.reason, LowLikelihood)
     assert closure.reason.log_marginal_likelihood == -90.0
     assert -30.0 < closure.reason.median_nats <= -20.0
     taken = Run(list(REGULAR_DEG))
-    taken.run(Closer(), told(13, wrong=-45.0))
+    taken.run(Closer(), stated(13, wrong=-45.0))
     assert all(edge.accepted for edge in taken.judged[13])
 
 
 def test_scattered_or_missing_evidence_rejects_nothing() -> None:
-    for spoil in (told(13, scatter=15.0), lambda posterior: witnessed(posterior, np.nan)):
+    for spoil in (stated(13, scatter=15.0), lambda posterior: witnessed(posterior, np.nan)):
         run = Run(list(REGULAR_DEG))
         run.run(Closer(), spoil)
         assert all(edge.accepted for edge in run.judged[13])
@@ -394,7 +405,7 @@ def _map_view(run: Run) -> MapView:
 
 def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contradict_it() -> None:
     run = Run(list(REGULAR_DEG[:9]))
-    run.run(Closer(), told(-1))
+    run.run(Closer(), stated(-1))
     truth, solution = run.measured(4, 8, np.random.default_rng(0), np.zeros(6)), run.solution  # as far as four steps
     doubtful = witnessed(replace(truth, source=12, target=8), -90.0)
     map_view = MapView(run.views, solution, run.graph.edges)

@@ -35,9 +35,9 @@ FRAMES = [0, 1, 2, 3, 4]
 
 def gains(map_view: MapView, angle_deg: npt.ArrayLike, max_angle_deg: float = 90.0, **how: Any) -> dict[int, Candidate]:
     """Return what an edge from frame 6 to earlier ones should add, by frame, if it turned by these angles."""
-    told = {"systematic": 1e-9 * SYSTEMATIC, "has_own_edge": False} | how
+    given = {"systematic": 1e-9 * SYSTEMATIC, "has_own_edge": False} | how
     information_gain = InformationGain(
-        map_view, 6, map_view.solution.trajectory[6], max_angle_deg=max_angle_deg, **told
+        map_view, 6, map_view.solution.trajectory[6], max_angle_deg=max_angle_deg, **given
     )
     found = information_gain.candidates(FRAMES, np.broadcast_to(np.asarray(angle_deg, dtype=np.float64), 5), 0.0)
     assert [candidate.gain_nats for candidate in found] == sorted((c.gain_nats for c in found), reverse=True)

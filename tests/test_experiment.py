@@ -271,25 +271,25 @@ def test_only_steps_once_round_are_a_loop(pairing: Pairing) -> None:
 
 
 def run(out: Path, *recordings: Recording) -> list[Trial]:
-    told: list[Trial] = []
-    evaluate(recordings or [Recording()], experiment(), out, draw=rotation_errors, report=told.append)
-    return told
+    given: list[Trial] = []
+    evaluate(recordings or [Recording()], experiment(), out, draw=rotation_errors, report=given.append)
+    return given
 
 
 def test_writes_json_csv_and_a_figure(tmp_path: Path) -> None:
-    told = run(tmp_path / "new" / "folder", Recording(), Recording(name="with a lost frame", lost=1))
+    given = run(tmp_path / "new" / "folder", Recording(), Recording(name="with a lost frame", lost=1))
     folder = tmp_path / "new" / "folder"
     assert sorted(p.name for p in folder.iterdir()) == ["results.csv", "results.json", "rotation_errors.png"]
     results = json.loads((folder / "results.json").read_text())
     assert results["schema"] == 1
     assert results["pairing"] == {"offsets": [1, 2], "both_ways": False, "closed": False}
-    assert len(results["trials"]) == len(told) == 20
+    assert len(results["trials"]) == len(given) == 20
     assert len(results["summaries"]) == 8
     assert results["summaries"][0]["rotation_error_deg"]["median"] < 3.0
     assert np.shape(results["trials"][0]["target_from_source"]) == (16,)
     table = list(csv.DictReader(io.StringIO((folder / "results.csv").read_text())))
     assert len(table) == 20
-    for row, record, one in zip(table, results["trials"], told, strict=True):
+    for row, record, one in zip(table, results["trials"], given, strict=True):
         assert row["method"] == record["method"] == one.method
         if math.isfinite(one.rotation_error_deg):
             assert float(row["rotation_error_deg"]) == record["rotation_error_deg"] == one.rotation_error_deg

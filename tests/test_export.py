@@ -105,8 +105,8 @@ def test_3mf_is_read_by_its_library_with_unit_and_colours(tmp_path: Path, colour
         group = content.GetColorGroupByID(properties[0].ResourceID)
         for corner, found in zip(corners, properties, strict=True):
             colours = [group.GetColor(number) for number in found.PropertyIDs]
-            told = [(colour.Red, colour.Green, colour.Blue) for colour in colours]
-            np.testing.assert_array_equal(told, model.vertex_colours[corner])
+            given = [(colour.Red, colour.Green, colour.Blue) for colour in colours]
+            np.testing.assert_array_equal(given, model.vertex_colours[corner])
     before = out.read_bytes()
     write_mesh(model, out)
     assert out.read_bytes() == before

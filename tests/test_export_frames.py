@@ -62,10 +62,10 @@ def test_the_sidecar_takes_every_export_back(tmp_path: Path, origin: Origin, up:
         assert se3.is_rigid(place.object_from_mesh, tolerance=1e-9, farthest_m=10.0)
         write_mesh(place.placed(model), out, object_from_upright=AS_GIVEN, axes=place.axes)
         place.write(out)
-        told = json.loads(pose_file(out).read_text())
-        assert (told["mesh"], told["unit"], told["axes"]) == (out.name, "m", place.axes)
+        given = json.loads(pose_file(out).read_text())
+        assert (given["mesh"], given["unit"], given["axes"]) == (out.name, "m", place.axes)
         mesh = trimesh.load_mesh(out, process=False)  # of a scene with its nodes' turns
-        mesh.apply_transform(np.reshape(told["object_from_mesh"], (4, 4)))
+        mesh.apply_transform(np.reshape(given["object_from_mesh"], (4, 4)))
         np.testing.assert_allclose(mesh.triangles, model.vertices_m[model.triangles], atol=2e-6)
 
 

@@ -339,10 +339,10 @@ def _check_bop(out: Path, built: Path) -> None:
         row, column, depth = row[inside], column[inside], points[inside, 2]
         facing = frame.mask[row, column] & (np.abs(frame.depth_m[row, column] - depth) < 0.01)
         assert facing.mean() > 0.2  # the side that this frame sees
-        (told,) = info[str(index)]
-        assert told["px_count_visib"] == frame.mask.sum()
-        assert 0.5 < told["visib_fract"] <= 1.0
-        left, top, width, height = told["bbox_obj"]
+        (stated,) = info[str(index)]
+        assert stated["px_count_visib"] == frame.mask.sum()
+        assert 0.5 < stated["visib_fract"] <= 1.0
+        left, top, width, height = stated["bbox_obj"]
         assert left - 2 <= column.min()
         assert column.max() <= left + width + 2
         assert top - 2 <= row.min()

@@ -274,12 +274,12 @@ def _two_modes() -> Posterior:
     return replace(sure, pose=wide, modes=modes)
 
 
-def test_modes_are_told_apart_instead_of_called_free() -> None:
+def test_modes_are_kept_apart_instead_of_called_free() -> None:
     (said,) = undetermined(_two_modes(), _view((0.03, 0.03, 0.03)))
     assert [words for words in ("90°", "the table's normal", "30 %", "70 %") if words not in said] == []
 
 
-def test_modes_that_lie_near_each_other_are_told_in_one_line() -> None:
+def test_modes_that_lie_near_each_other_are_reported_in_one_line() -> None:
     sure = _two_modes()
     near = PoseGaussian(sure.modes[0].pose.mean @ spin(np.radians(2.0) * NORMAL), sure.modes[0].pose.covariance)
     heaviest, turned = (replace(mode, weight=weight) for mode, weight in zip(sure.modes, (0.4, 0.3), strict=True))

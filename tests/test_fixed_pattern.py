@@ -86,7 +86,7 @@ def test_balls_that_carry_the_cameras_pattern_do_not_seem_to_stand_still() -> No
     assert all(posterior.usable for posterior, _ in believed)
     degrees_of_freedom = 3 * len(seeds)
     assert sum(wrong for _, wrong in believed) > chi2.ppf(0.99, degrees_of_freedom)  # 1 in 100 of true covariances
-    told = [registered(1.0, seed) for seed in seeds]
-    assert sum(right for _, right in told) < chi2.ppf(0.5, degrees_of_freedom)
-    for posterior, _ in told:
+    given = [registered(1.0, seed) for seed in seeds]
+    assert sum(right for _, right in given) < chi2.ppf(0.5, degrees_of_freedom)
+    for posterior, _ in given:
         assert np.degrees(np.sqrt(np.linalg.eigvalsh(posterior.pose.covariance[:3, :3])).min()) > 10.0

@@ -267,17 +267,17 @@ def built(sigma_focal: float) -> tuple[Step, dict[int, Array]]:
 
 
 def test_poses_and_views_of_a_run_are_those_of_the_focal_length_that_its_loops_tell() -> None:
-    (told, truth), (held, _) = built(0.02), built(0.0)
-    focal = told.solution.focal
+    (shown, truth), (held, _) = built(0.02), built(0.0)
+    focal = shown.solution.focal
     assert focal is not None
     assert held.solution.focal is None
     assert focal.told_by == "loop"
     assert focal.factor == pytest.approx(1.0 / 1.03, abs=0.01)
     assert abs(np.log(1.03 * focal.factor)) < 3.0 * focal.sigma
-    ratio = told.views[0].frame.camera.fx / held.views[0].frame.camera.fx
+    ratio = shown.views[0].frame.camera.fx / held.views[0].frame.camera.fx
     assert ratio == pytest.approx(focal.factor)
     off, squares = [], []
-    for step in (told, held):
+    for step in (shown, held):
         poses = {frame: step.solution.relative_gaussian(0, frame) for frame in step.views if frame}
         off.append(np.mean([rotation_error_deg(pose.mean, true_motion(truth, 0, k)) for k, pose in poses.items()]))
         squares.append(np.mean([nees(pose, true_motion(truth, 0, k)) / 6.0 for k, pose in poses.items()]))
@@ -286,9 +286,9 @@ def test_poses_and_views_of_a_run_are_those_of_the_focal_length_that_its_loops_t
 
 
 def test_edges_of_an_accepted_graph_are_those_under_the_focal_length() -> None:
-    told, _ = built(0.02)
-    assert all(isinstance(one, Edge) for one in told.edges_so_far)
-    chi = MovingGraph.of(PoseGraph(told.edges_so_far), told.solution).estimate(0.02)
+    shown, _ = built(0.02)
+    assert all(isinstance(one, Edge) for one in shown.edges_so_far)
+    chi = MovingGraph.of(PoseGraph(shown.edges_so_far), shown.solution).estimate(0.02)
     assert abs(chi.log_factor) < 0.003
 
 

@@ -120,7 +120,7 @@ def test_axis_does_not_repeat_what_edges_hold(tilt_rad: float) -> None:
     for seed in range(seeds):
         rng = np.random.default_rng([9, seed])
         truth, camera_from_axis = _table(rng)
-        held = [_told(e, camera_from_axis, direction=np.isinf(tilt_rad)) for e in _graph(rng, truth).edges]
+        held = [_stated(e, camera_from_axis, direction=np.isinf(tilt_rad)) for e in _graph(rng, truth).edges]
         graph = PoseGraph(tuple(held), first=0)
         plain, solution = solve(graph, {}), solve(graph, {}, axis=shared)
         assert solution.camera_from_axis is not None
@@ -131,16 +131,16 @@ def test_axis_does_not_repeat_what_edges_hold(tilt_rad: float) -> None:
     assert np.mean(poses) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / seeds))
 
 
-def _told(of: Edge, camera_from_axis: Array, *, direction: bool) -> Edge:
-    """Return an edge told as well how far its step turned and climbed, and tilted if the axis' direction is known."""
+def _stated(of: Edge, camera_from_axis: Array, *, direction: bool) -> Edge:
+    """Return an edge that also has how far its step turned and climbed, and tilted if the axis' direction is known."""
     sigmas = np.array([TABLE.sigma_tilt_rad if direction else 10.0] * 2 + [SIGMA_STEP_RAD, 10.0, 10.0, 0.0005])
     to_axis = se3.adjoint(se3.inverse(camera_from_axis))
-    told = to_axis.T @ np.diag(sigmas**-2.0) @ to_axis
+    given = to_axis.T @ np.diag(sigmas**-2.0) @ to_axis
     nominal = camera_from_axis @ se3.exp(np.array([0.0, 0.0, STEP_RAD, 0.0, 0.0, 0.0])) @ se3.inverse(camera_from_axis)
     pose = of.posterior.pose
     images = np.linalg.inv(pose.covariance)
-    spread = np.asarray(np.linalg.inv(images + told), dtype=np.float64)
-    pull = told @ se3.log(se3.inverse(pose.mean) @ nominal)
+    spread = np.asarray(np.linalg.inv(images + given), dtype=np.float64)
+    pull = given @ se3.log(se3.inverse(pose.mean) @ nominal)
     return edge(of.target, of.source, PoseGaussian(pose.mean @ se3.exp(spread @ pull), spread))
 
 
@@ -173,7 +173,7 @@ def test_table_on_which_things_are_pushed_about_still_has_one_normal() -> None:
 
 
 def test_axis_that_does_not_fit_is_left_out() -> None:
-    """An object that is pushed about by centimetres does not turn about one axis, whatever we are told."""
+    """An object that is pushed about by centimetres does not turn about one axis, whatever is given."""
     rng = np.random.default_rng(3)
     truth, camera_from_axis = _table(rng)
     fitting = solve(_graph(rng, truth), {}, axis=TABLE)

@@ -100,7 +100,7 @@ def test_the_report_shows_the_chain_of_odometry_txt(tmp_path: Path) -> None:
 
 
 def _turned(of: Edge) -> Edge:
-    """The same knowledge, told as the motion from target to source."""
+    """The same knowledge, given as the motion from target to source."""
     return edge(of.source, of.target, of.posterior.pose.inverse(), of.kind)
 
 
@@ -143,8 +143,8 @@ def test_motions_along_chains_are_those_composed_edge_by_edge() -> None:
     rng = np.random.default_rng(7)
     parents = {frame: int(rng.integers(max(frame - 4, 0), frame)) for frame in range(1, 40) if frame != 20}
     motions = {frame: PoseGaussian(spin(rng.normal(size=3)), covariance(rng)) for frame in parents}
-    told = [(parents[k], k, pose) if k % 3 else (k, parents[k], pose.inverse()) for k, pose in motions.items()]
-    chains = Chains.of([told[k] for k in rng.permutation(len(told))])
+    given = [(parents[k], k, pose) if k % 3 else (k, parents[k], pose.inverse()) for k, pose in motions.items()]
+    chains = Chains.of([given[k] for k in rng.permutation(len(given))])
 
     def to_root(frame: int) -> list[int]:
         return [frame, *(to_root(parents[frame]) if frame in parents else ())]

@@ -67,7 +67,7 @@ def test_every_study_that_a_page_names_exists() -> None:
     assert named <= set(STUDIES)
 
 
-def test_every_place_that_contributors_are_told_of_exists() -> None:
+def test_every_place_that_contributors_are_referred_to_exists() -> None:
     places = set(re.findall(r"`((?:modeler|sequences|viz|tests|studies|docs)/[\w./]*)`", CONTRIBUTING.read_text()))
     assert len(places) > 20
     assert [place for place in sorted(places) if not (ROOT / place).exists()] == []

@@ -33,7 +33,7 @@ def with_files_of_at_most(size: int, *arguments: str) -> int:
 
 
 def ours(said: str) -> list[str]:
-    """Return the lines of the program; Rerun complains where tests loaded it before the program told it not to."""
+    """Return the lines of the program; Rerun complains where tests loaded it before the program asked it not to."""
     return [line for line in said.splitlines() if line.startswith("modeler: ")]
 
 

@@ -268,7 +268,7 @@ def test_converting_a_broken_sequence_leaves_nothing(written: Path, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
-def test_what_is_told_as_a_scale_is_checked(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_given_as_a_scale_is_checked(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(written / "tum"), "--depth-scale-mm", "1000"]) == 2
     assert "it looks like millimetres" in capsys.readouterr().err
     assert main(["info", str(written / "tum"), "--depth-scale-mm", "-1"]) == 2

@@ -30,12 +30,12 @@ ENTRIES = st.dictionaries(KEYS, JSON | st.dictionaries(KEYS, JSON, max_size=3), 
     "name",
     [pytest.param(name, marks=pytest.mark.slow) if target.share <= 0.1 else name for name, target in TARGETS.items()],
 )
-def test_damage_is_told_in_one_line_or_does_not_matter(tmp_path: Path, name: str) -> None:
+def test_damage_is_reported_in_one_line_or_does_not_matter(tmp_path: Path, name: str) -> None:
     target, rng = TARGETS[name], np.random.default_rng([7, list(TARGETS).index(name)])
     path, files = fresh(target, tmp_path / "in")
     intact = {file: file.read_bytes() for file in files}
     target.read(path)
-    told: list[str] = []
+    stated: list[str] = []
     count = max(2, round(INPUTS * min(1.0, target.share)))
     for _ in range(count):
         file = files[int(rng.integers(len(files)))]
@@ -43,10 +43,10 @@ def test_damage_is_told_in_one_line_or_does_not_matter(tmp_path: Path, name: str
         try:
             target.read(path)
         except InputError as error:
-            told.append(str(error))
+            stated.append(str(error))
         file.write_bytes(intact[file])
-    assert told or count < INPUTS // 2
-    assert "\n" not in "".join(told)
+    assert stated or count < INPUTS // 2
+    assert "\n" not in "".join(stated)
     target.read(path)
 
 
@@ -61,15 +61,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @settings(max_examples=60)
 def test_any_json_is_read_or_refused(scene: Path, which: str, tree: object) -> None:
     path = scene / which
-    intact, told = path.read_bytes(), ""
+    intact, stated = path.read_bytes(), ""
     try:
         path.write_text(json.dumps(tree))
         survey(open_sequence(scene))
     except InputError as error:
-        told = str(error)
+        stated = str(error)
     finally:
         path.write_bytes(intact)
-    assert "\n" not in told
+    assert "\n" not in stated
 
 
 @given(tree=ENTRIES | JSON)

@@ -87,15 +87,15 @@ def test_the_unit_of_depth_that_stands_beside_the_intrinsics_counts(
     """BOP's mm a unit, RealSense's m a unit, Open3D's units a m."""
     write_open3d(tmp_path / "s", frames)
     (tmp_path / "s" / "camera_intrinsic.json").unlink()
-    told = {"fx": 143.75, "fy": 143.75, "cx": 79.875, "cy": 59.875, "depth_scale": scale}
-    (tmp_path / "s" / "camera.json").write_text(json.dumps(told))
+    stated = {"fx": 143.75, "fy": 143.75, "cx": 79.875, "cy": 59.875, "depth_scale": scale}
+    (tmp_path / "s" / "camera.json").write_text(json.dumps(stated))
     sequence = open_sequence(tmp_path / "s")
     assert sequence.layout == "folder of pictures"
     assert sequence.depth_unit == f"{unit} (camera.json)"
     given = open_sequence(tmp_path / "s", Overrides(depth_scale_mm=3.0))
     ratio = np.nanmedian(given.frame(0).depth_m / sequence.frame(0).depth_m)
     assert ratio == pytest.approx(3.0 / float(unit.split()[0]), rel=1e-5)
-    (tmp_path / "s" / "camera.json").write_text(json.dumps({**told, "depth_scale": 30}))
+    (tmp_path / "s" / "camera.json").write_text(json.dumps({**stated, "depth_scale": 30}))
     with pytest.raises(InputError, match=r"camera\.json: .*depth_scale.* 30\b"):
         open_sequence(tmp_path / "s")
 

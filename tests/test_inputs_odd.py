@@ -80,7 +80,7 @@ def test_two_frames_are_a_model(frames: list[Frame], tmp_path: Path) -> None:
     assert (status, len(report["poses"]), len(report["edges"])) == (0, 2, 1)
 
 
-def test_an_object_that_leaves_is_told_frame_by_frame(
+def test_an_object_that_leaves_is_reported_frame_by_frame(
     frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     left = [*map(unmasked, frames[:3]), bare(frames[3]), bare(frames[4])]

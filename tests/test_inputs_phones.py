@@ -116,7 +116,7 @@ def test_lists_of_nerfstudio_are_read(tmp_path: Path, frames: list[Frame]) -> No
         open_sequence(tmp_path)
 
 
-def test_exchanged_bytes_are_told(tmp_path: Path, frames: list[Frame]) -> None:
+def test_exchanged_bytes_are_reported(tmp_path: Path, frames: list[Frame]) -> None:
     save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0).byteswap())
     facts = {name: getattr(frames[0].camera, name) for name in ("fx", "fy", "cx", "cy")}
     (tmp_path / "camera.json").write_text(json.dumps(facts))
@@ -149,7 +149,9 @@ def test_info_draws_what_it_read(tmp_path: Path, frames: list[Frame], cli: Run) 
 
 
 @pytest.mark.parametrize(("step_deg", "refused"), [(24.0, True), (1.0, False)])
-def test_names_that_are_angles_are_told(tmp_path: Path, frames: list[Frame], *, step_deg: float, refused: bool) -> None:
+def test_names_that_are_angles_are_reported(
+    tmp_path: Path, frames: list[Frame], *, step_deg: float, refused: bool
+) -> None:
     for frame in frames:
         save(tmp_path / "depth" / f"{24 * frame.index}.png", raw_depth(frame, 1.0))
     facts = {name: getattr(frames[0].camera, name) for name in ("fx", "fy", "cx", "cy")}

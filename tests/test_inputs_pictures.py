@@ -195,7 +195,7 @@ def test_colour_without_depth_is_refused(tmp_path: Path, frames: list[Frame]) ->
         open_sequence(tmp_path / "hot3d")
 
 
-def test_the_folder_of_the_images_alone_is_told_from_its_sequence(tmp_path: Path, frames: list[Frame]) -> None:
+def test_the_folder_of_the_images_alone_is_distinguished_from_its_sequence(tmp_path: Path, frames: list[Frame]) -> None:
     write_bop(tmp_path / "scene", frames[:1], depth_scale_mm=1.0)
     with pytest.raises(InputError, match=rf"give the one it lies in, {tmp_path / 'scene'}"):
         open_sequence(tmp_path / "scene" / "depth")

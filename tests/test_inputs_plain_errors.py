@@ -57,14 +57,14 @@ def test_aligned_colour_is_believed(tmp_path: Path) -> None:
     assert cards(tmp_path / "s").misaligned is None
 
 
-def test_mirrored_colour_is_told(tmp_path: Path) -> None:
+def test_mirrored_colour_is_reported(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", mirrored=True)
     assert found.misaligned is not None
     assert found.misaligned.flip == "mirrored"
     assert found.doubts[0].startswith("colour is mirrored")
 
 
-def test_shifted_colour_is_told_by_how_much(tmp_path: Path) -> None:
+def test_shifted_colour_is_reported_by_how_much(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", shift_px=(20.0, -12.0))
     assert found.misaligned is not None
     assert not found.misaligned.flip
@@ -75,14 +75,14 @@ def test_shifted_colour_is_told_by_how_much(tmp_path: Path) -> None:
     found.check("cards", despite_doubts=True)
 
 
-def test_colour_of_another_lens_is_told(tmp_path: Path) -> None:
+def test_colour_of_another_lens_is_reported(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", scale=1.25, shift_px=(-12.0, 0.0))
     assert found.misaligned is not None
     assert found.misaligned.scale == pytest.approx((1.25, 1.25), abs=0.05)
     assert found.misaligned.shift_px == pytest.approx((-12.0, 0.0), abs=4.0)
 
 
-def test_distance_along_the_ray_is_told_and_mended(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_distance_along_the_ray_is_reported_and_mended(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     whole = open_sequence(bundled("box"))
     camera = whole.frame(0).camera
     for index in whole.indices[:3]:
@@ -153,7 +153,7 @@ def test_images_packed_by_rvl_are_read(frames: list[Frame], rng: np.random.Gener
         from_rvl(b"", "bag")
 
 
-def test_colour_upside_down_is_told(tmp_path: Path) -> None:
+def test_colour_upside_down_is_reported(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", upside_down=True)
     assert found.misaligned is not None
     assert found.misaligned.flip == "upside down"

@@ -343,7 +343,7 @@ def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("told", "data", "says"),
+    ("given", "data", "says"),
     [
         ("YUYV; zstd; 4x2 step=8", b"nothing", "cannot be unpacked"),
         ("YUYV; zstd; 4x2 step=8", zstd.compress(bytes(16))[:-3], "cannot be unpacked"),
@@ -353,8 +353,8 @@ def test_mcap_of_other_systems_says_so(tmp_path: Path, capfd: pytest.CaptureFixt
         ("UYVY; zstd; 99999x99999 step=199998", zstd.compress(bytes(16)), "99999 x 99999 pixels"),
     ],
 )
-def test_packed_chroma_that_is_not_what_it_says_is_one_line(told: str, data: bytes, says: str) -> None:
-    message = SimpleNamespace(__msgtype__=messages.PACKED, format=told, data=np.frombuffer(data, np.uint8))
+def test_packed_chroma_that_is_not_what_it_says_is_one_line(given: str, data: bytes, says: str) -> None:
+    message = SimpleNamespace(__msgtype__=messages.PACKED, format=given, data=np.frombuffer(data, np.uint8))
     assert messages.is_colour(message)
     with pytest.raises(InputError, match=says):
         messages.colour(message, "here")

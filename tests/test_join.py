@@ -227,9 +227,9 @@ def test_exports_that_cannot_be_are_said_in_one_line(
 ) -> None:
     arguments = [str(tmp_path / word) if word.startswith("a.") else word for word in arguments]
     assert main(["export", str(runs[0]), *arguments]) == 2
-    told = capfd.readouterr().err
-    assert words in told
-    assert told.count("\n") == 1
+    stated = capfd.readouterr().err
+    assert words in stated
+    assert stated.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
@@ -276,7 +276,7 @@ def test_joins_that_cannot_be_are_said_in_one_line(
         ([str(runs[0]), f"{runs[0]}/../{runs[0].name}", "--out", str(tmp_path / "new")], "name two runs"),
     ):
         assert main(["join", *arguments]) == 2
-        told = capfd.readouterr().err
-        assert words in told
-        assert told.count("\n") == 1
+        stated = capfd.readouterr().err
+        assert words in stated
+        assert stated.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

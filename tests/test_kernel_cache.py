@@ -166,5 +166,5 @@ def test_that_kernels_are_kept_elsewhere_is_said(
     assert capsys.readouterr().err == ""  # nothing is missing
     monkeypatch.setattr(compiling, "_JOBS", {"nothing": compiling._Job(lambda: None, ("tsdf", "_observe"))})
     compiling.compile_kernels(say)
-    told = capsys.readouterr().err.splitlines()
-    assert told[0] == f"modeler: compiled kernels are kept in {tmp_path}, as {cache.folder()} cannot be written"
+    given = capsys.readouterr().err.splitlines()
+    assert given[0] == f"modeler: compiled kernels are kept in {tmp_path}, as {cache.folder()} cannot be written"

@@ -1,4 +1,4 @@
-"""What to do next, told while a run goes on."""
+"""What to do next, said while a run goes on."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Slow:
 
 
 def test_steps_that_come_while_it_predicts_are_passed_over_but_the_newest(modeler: Modeler, steps: list[Step]) -> None:
-    slow, told = Slow(modeler), []
+    slow, given = Slow(modeler), []
     done = threading.Event()
 
     def tell(step: Step, *_: Any) -> None:
-        told.append(step.frame.index)
-        if len(told) == 2:
+        given.append(step.frame.index)
+        if len(given) == 2:
             done.set()
 
     with advising(cast("Modeler", slow), tell) as advise:
@@ -67,17 +67,17 @@ def test_steps_that_come_while_it_predicts_are_passed_over_but_the_newest(modele
             advise(step)
         slow.go.set()
         assert done.wait(60.0)
-    assert told == [0, 1]
+    assert given == [0, 1]
 
 
-def test_what_has_not_begun_when_the_run_ends_is_not_told(modeler: Modeler, steps: list[Step]) -> None:
-    slow, told = Slow(modeler), []
-    with advising(cast("Modeler", slow), lambda step, *_: told.append(step.frame.index)) as advise:
+def test_what_has_not_begun_when_the_run_ends_is_not_reported(modeler: Modeler, steps: list[Step]) -> None:
+    slow, given = Slow(modeler), []
+    with advising(cast("Modeler", slow), lambda step, *_: given.append(step.frame.index)) as advise:
         advise(steps[0])
         assert slow.begun.wait(60.0)
         advise(steps[1])
         threading.Timer(0.2, slow.go.set).start()
-    assert told == [0]
+    assert given == [0]
 
 
 def test_frames_left_out_ask_for_no_advice(modeler: Modeler, steps: list[Step]) -> None:
@@ -103,9 +103,7 @@ def test_what_goes_wrong_is_raised_at_the_end(modeler: Modeler, steps: list[Step
         advised()
 
 
-def test_the_bar_says_the_next_turn_and_no_poke_that_the_run_is_not_told_of(
-    modeler: Modeler, steps: list[Step]
-) -> None:
+def test_the_bar_says_the_next_turn_and_no_poke_that_the_run_is_not_given(modeler: Modeler, steps: list[Step]) -> None:
     step = steps[1]
     belief = modeler.belief(step.views, step.solution, step.edges_so_far)
     found = suggest(belief)

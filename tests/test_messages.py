@@ -86,7 +86,7 @@ def test_long_work_tells_how_long_it_takes_and_that_it_goes_on(
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(3.0, "10 s"), (44.0, "40 s"), (100.0, "2 min"), (700.0, "12 min")])
-def test_durations_are_told_to_about_a_tenth(seconds: float, words: str) -> None:
+def test_durations_are_reported_to_about_a_tenth(seconds: float, words: str) -> None:
     assert console._rounded(seconds) == words
 
 

@@ -71,7 +71,7 @@ def test_a_model_ten_millimetres_too_far_scores_less_than_one_of_true_poses(mode
     assert scores["true", "seen"].f_3mm > 0.97
 
 
-def test_one_wrong_pose_is_told(modelled: Modelled) -> None:
+def test_one_wrong_pose_is_reported(modelled: Modelled) -> None:
     off = se3.exp(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0]))
     wrong = {**modelled.trajectory, 9: modelled.trajectory[9] @ off}
     scores = model_scores(replace(modelled, trajectory=wrong), FUSER, 0)
@@ -234,14 +234,16 @@ def _without(scene: Path, built: Path, folder: Path, *names: str) -> tuple[Path,
     return sequence, run
 
 
-@pytest.mark.parametrize(("missing", "told"), [("model.ply", "no true surface"), ("scene_gt.json", "no ground truth")])
+@pytest.mark.parametrize(
+    ("missing", "stated"), [("model.ply", "no true surface"), ("scene_gt.json", "no ground truth")]
+)
 def test_runs_without_truth_are_refused_in_one_line(
-    scene: Path, built: Path, tmp_path: Path, cli: Run, missing: str, told: str
+    scene: Path, built: Path, tmp_path: Path, cli: Run, missing: str, stated: str
 ) -> None:
     _, run = _without(scene, built, tmp_path, missing)
     status, out, err = cli("evaluate", run, "--out", tmp_path / "none")
     assert (status, out, err.count("\n")) == (2, "", 1)
-    assert told in err
+    assert stated in err
     assert not (tmp_path / "none").exists()
 
 

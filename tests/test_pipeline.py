@@ -280,16 +280,16 @@ def test_at_the_end_views_two_steps_apart_are_registered_too_and_judged() -> Non
     assert len(none.edges_so_far) == len(last.edges_so_far) - len(spans)
     assert np.mean(_rotation_errors(last.solution)) < np.mean(_rotation_errors(none.solution))
     shared = run(registrar=Oracle(noise=1.0), closer=closer, prior=AnyPrior(axis=SharedAxis(1e-4, 1e-5)))[-1]
-    assert len(shared.edges_so_far) == len(none.edges_so_far)  # their noise is not told apart from slip
+    assert len(shared.edges_so_far) == len(none.edges_so_far)  # their noise is not distinguished from slip
 
 
 def test_the_end_tells_how_far_it_is_and_can_be_cut_short() -> None:
     closer = Closer(max_span_deg=85.0, min_span_gain_nats=0.0, thresholds=Thresholds(min_overlap=0.2))
     building = modeler(registrar=Oracle(noise=1.0), closer=closer)
     events = list(building.run(FRAMES, Scene()))
-    told = [event for event in events if not isinstance(event, Step)]
-    total = len(told) - 3
-    assert told == [Refining(0, None), *(Refining(done, total) for done in range(total + 1)), Fusing()]
+    given = [event for event in events if not isinstance(event, Step)]
+    total = len(given) - 3
+    assert given == [Refining(0, None), *(Refining(done, total) for done in range(total + 1)), Fusing()]
     last = events[-1]
     assert isinstance(last, Step)
     none = run(registrar=Oracle(noise=1.0), closer=replace(closer, max_spans=0))[-1]
@@ -482,13 +482,13 @@ def test_frames_held_in_the_air_do_not_keep_those_after_them_from_being_a_segmen
     assert sorted(steps[-1].solution.trajectory) == [0, 1, 2]
 
 
-def test_frames_tried_once_more_in_vain_are_told_of_too() -> None:
+def test_frames_tried_once_more_in_vain_are_reported_too() -> None:
     hopeless = frozenset((source, target) for source in (2, 3, 5) for target in range(9))
     steps = run(FRAMES, registrar=Oracle(apart=hopeless, reach=9.0))
     assert [step.frame.index for step in steps] == [*range(9), 8]
-    told = {(edge.source, edge.target): edge.accepted for edge in steps[-1].edges_so_far}
-    assert [told[pair] for pair in ((2, 4), (3, 4), (5, 6))] == [False] * 3
-    assert len(told) == len(steps[-1].edges_so_far)
+    given = {(edge.source, edge.target): edge.accepted for edge in steps[-1].edges_so_far}
+    assert [given[pair] for pair in ((2, 4), (3, 4), (5, 6))] == [False] * 3
+    assert len(given) == len(steps[-1].edges_so_far)
     assert sorted(steps[-1].solution.trajectory) == [0, 1, 4, 6, 7, 8]
 
 
@@ -569,16 +569,16 @@ def test_one_frame_or_two_are_a_sequence(count: int) -> None:
     assert last.model is not None
 
 
-@pytest.mark.parametrize(("frames", "told"), [(1, 1), (3, 3), (15, 15), (16, 15), (1000, 15)])
-def test_a_scene_is_told_by_few_frames_spread_over_the_sequence(frames: int, told: int) -> None:
+@pytest.mark.parametrize(("frames", "given"), [(1, 1), (3, 3), (15, 15), (16, 15), (1000, 15)])
+def test_a_scene_is_learned_from_few_frames_spread_over_the_sequence(frames: int, given: int) -> None:
     indices = range(7, 7 + 2 * frames, 2)
     chosen = scene_frames(indices)
-    assert len(chosen) == len(set(chosen)) == told
+    assert len(chosen) == len(set(chosen)) == given
     assert set(chosen) <= set(indices)
     assert chosen[0] == indices[0]
     assert chosen[-1] == indices[-1] or frames == 1
     gaps = np.diff(chosen)
-    assert np.ptp(gaps) <= 2 if len(gaps) else told == 1
+    assert np.ptp(gaps) <= 2 if len(gaps) else given == 1
 
 
 def test_only_frames_that_a_view_followed_soon_are_tried_again_newest_first() -> None:

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from prior_cases import CASES, NORMAL, edges, held, solution, told, truth, turned, turntable, view, views
+from prior_cases import CASES, NORMAL, edges, held, solution, stated, truth, turned, turntable, view, views
 from scipy import stats
 
 from modeler import priors, se3
@@ -275,14 +275,14 @@ def test_the_axis_is_that_of_the_newest_pairs() -> None:
 
 
 def test_a_learnt_axis_is_a_line_without_an_upper_end() -> None:
-    told_up, told_down = (
+    stated_up, stated_down = (
         turntable(HERE, learned_axis=Axis(side * NORMAL, 0.01, np.array([0.02, 0.03, 0.82]), 0.001))
         for side in (1.0, -1.0)
     )
-    samples = told_up.between(SOURCE, TARGET).sample(200, np.random.default_rng(0))
+    samples = stated_up.between(SOURCE, TARGET).sample(200, np.random.default_rng(0))
     np.testing.assert_allclose(
-        told_down.between(SOURCE, TARGET).log_density(samples),
-        told_up.between(SOURCE, TARGET).log_density(samples),
+        stated_down.between(SOURCE, TARGET).log_density(samples),
+        stated_up.between(SOURCE, TARGET).log_density(samples),
         rtol=1e-9,
     )
 
@@ -305,7 +305,7 @@ def test_wherever_the_centre_of_friction_lies_the_contact_goes_with_the_finger()
     aside = 0.03 * np.cross(NORMAL, across)
     contact_m = TARGET.centroid_m + aside
     prior = PokePrior(
-        Poke(told(contact_m), told(across), 0.01),
+        Poke(stated(contact_m), stated(across), 0.01),
         poke_sigma_m=1e-6,
         poke_sigma_deg=1e-4,
         centre_sigma_m=0.03,

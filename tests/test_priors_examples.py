@@ -15,8 +15,8 @@ from prior_cases import (
     hand,
     held,
     solution,
+    stated,
     surface,
-    told,
     truth,
     turned,
     turntable,
@@ -84,7 +84,7 @@ def test_of_any_axis_every_direction_is_as_likely(rng: np.random.Generator) -> N
 
 
 def test_a_turntable_does_not_lift_the_object(rng: np.random.Generator) -> None:
-    for prior in (TurntablePrior(24.0, 1.0), turntable(HERE, axis_point_m=told(AXIS_POINT_M))):
+    for prior in (TurntablePrior(24.0, 1.0), turntable(HERE, axis_point_m=stated(AXIS_POINT_M))):
         samples = prior.between(SOURCE, TARGET).sample(500, rng)
         moved = samples[:, :3, :3] @ SOURCE.centroid_m + samples[:, :3, 3] - SOURCE.centroid_m
         assert np.std(moved @ NORMAL) < 0.0015
@@ -92,7 +92,7 @@ def test_a_turntable_does_not_lift_the_object(rng: np.random.Generator) -> None:
 
 
 def test_a_turntable_without_any_error_is_still_a_density(rng: np.random.Generator) -> None:
-    prior = TurntablePrior(24.0, 0.0, axis_direction=told(NORMAL), axis_sigma_deg=0.0, wobble_deg=0.0, wobble_m=0.0)
+    prior = TurntablePrior(24.0, 0.0, axis_direction=stated(NORMAL), axis_sigma_deg=0.0, wobble_deg=0.0, wobble_m=0.0)
     density = prior.between(SOURCE, TARGET)
     samples = density.sample(100, rng)
     assert np.isfinite(density.log_density(samples)).all()
@@ -108,7 +108,7 @@ def test_larger_turns_leave_more_room_for_what_is_seen(rng: np.random.Generator)
 
 
 def test_a_known_axis_stays_where_it_is(rng: np.random.Generator) -> None:
-    prior = turntable(HERE, axis_point_m=told(AXIS_POINT_M), axis_sigma_m=1e-4, axis_sigma_deg=0.05, wobble_m=1e-4)
+    prior = turntable(HERE, axis_point_m=stated(AXIS_POINT_M), axis_sigma_m=1e-4, axis_sigma_deg=0.05, wobble_m=1e-4)
     samples = prior.between(SOURCE, TARGET).sample(500, rng)
     moved = samples[:, :3, :3] @ AXIS_POINT_M + samples[:, :3, 3] - AXIS_POINT_M
     assert np.abs(moved).max() < 1e-3
@@ -408,7 +408,7 @@ def poked(offset_m: Array, length_m: float = 0.03) -> tuple[PokePrior, Array]:
     """A push across the view beside the object's middle, and its direction in the table's plane."""
     across = np.cross(NORMAL, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
-    return PokePrior(Poke(told(TARGET.centroid_m + offset_m), told(across), length_m)), across
+    return PokePrior(Poke(stated(TARGET.centroid_m + offset_m), stated(across), length_m)), across
 
 
 def test_a_poke_moves_the_object_its_way(rng: np.random.Generator) -> None:
@@ -448,7 +448,7 @@ def test_every_poke_of_a_sequence_stands_at_its_frame() -> None:
 def test_a_poke_against_the_table_is_refused() -> None:
     prior, _ = poked(np.zeros(3))
     assert prior.poke is not None
-    pressed = PokePrior(replace(prior.poke, direction=told(-2.0 * NORMAL)))
+    pressed = PokePrior(replace(prior.poke, direction=stated(-2.0 * NORMAL)))
     with pytest.raises(InputError, match=r"between frames 0 and 1 .*direction"):
         pressed.between(at(1, TARGET), at(0, TARGET))
 

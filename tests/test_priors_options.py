@@ -121,7 +121,7 @@ def test_names_joined_by_plus_hold_together(name: str, expected: object) -> None
 
 
 @pytest.mark.parametrize("given", [{"max_rotation_deg": 40.0}, {"max_offset_m": 0.1}])
-def test_limits_that_are_told_hold(given: dict[str, Any]) -> None:
+def test_limits_that_are_given_hold(given: dict[str, Any]) -> None:
     assert chosen_prior(PriorOptions(), None).unlimited() == AutoPrior(AnyMotion(), AnyTurn())
     assert chosen_prior(PriorOptions(prior="general"), None).unlimited() == AnyMotion()
     assert chosen_prior(PriorOptions(**given), None).unlimited() is None
@@ -203,7 +203,7 @@ def test_pokes_are_read() -> None:
         (PriorOptions(), Telling({"kind": "poke", "pokes": {"1": {"point_m": [0, 0]}}}), "poke '1' must be"),
     ],
 )
-def test_what_cannot_be_used_is_told_in_a_line(options: PriorOptions, sequence: Telling | None, says: str) -> None:
+def test_what_cannot_be_used_is_reported_in_a_line(options: PriorOptions, sequence: Telling | None, says: str) -> None:
     with refused(says):
         chosen_prior(options, sequence)
 

@@ -135,18 +135,18 @@ def test_views_of_a_noisy_camera_overlap_where_they_fit() -> None:
     sigma_m, width_px = 0.003, 3.0
     poses = tabletop.turntable(24)[:2]
     shared = {}
-    for told in (0.0, sigma_m / 0.76**2):
-        sensor = Sensor(SensorNoise(0.001, 0.001), noise_area_px=4.0 * np.pi * width_px**2, sigma_inverse_per_m=told)
+    for given in (0.0, sigma_m / 0.76**2):
+        sensor = Sensor(SensorNoise(0.001, 0.001), noise_area_px=4.0 * np.pi * width_px**2, sigma_inverse_per_m=given)
         views = []
         for index, pose in enumerate(poses):
             frame = tabletop.view(tabletop.BRICK, pose, index).frame
             noise = gaussian_filter(np.random.default_rng(index).normal(size=frame.depth_m.shape), width_px)
             depth_m = (frame.depth_m + sigma_m * noise / noise.std()).astype(np.float32)
             views.append(sensor.ray_image(replace(frame, depth_m=depth_m, colour=None)))
-        assert views[0].range_noise_m == pytest.approx(sigma_m if told else 0.0, rel=0.05)
+        assert views[0].range_noise_m == pytest.approx(sigma_m if given else 0.0, rel=0.05)
         pair = VisibilityLikelihood().between(views[1], views[0], np.random.default_rng(0))
         truth = poses[0] @ se3.inverse(poses[1])
-        shared[told] = pair.overlap(truth), pair.overlap(se3.translation(np.array([0.0, 0.0, 0.03])) @ truth)
-    (untold, _), (told_right, told_wrong) = shared.values()
-    assert untold < 0.5 < told_right
-    assert told_wrong < 0.5
+        shared[given] = pair.overlap(truth), pair.overlap(se3.translation(np.array([0.0, 0.0, 0.03])) @ truth)
+    (untold, _), (stated_right, stated_wrong) = shared.values()
+    assert untold < 0.5 < stated_right
+    assert stated_wrong < 0.5

@@ -156,7 +156,7 @@ def test_every_section_is_there(page: str) -> None:
     assert {"Calibration of the covariances", "Pairs", "Settings"} <= set(headings)
 
 
-def test_every_pair_is_told_with_its_pictures(page: str, run: Path) -> None:
+def test_every_pair_is_reported_with_its_pictures(page: str, run: Path) -> None:
     result = Result.read(run)
     headings = Elements(page).headings
     for edge in result.edges:
@@ -188,7 +188,7 @@ def test_the_worst_pairs_come_first(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_undrawn")
-def test_surface_that_others_contradict_is_coloured_in_its_frame_and_the_remedy_told(run: Path, tmp_path: Path) -> None:
+def test_contradicted_surface_is_coloured_in_its_frame_and_the_remedy_stated(run: Path, tmp_path: Path) -> None:
     shutil.copytree(run, tmp_path / "wrong")
     report = json.loads((run / "report.json").read_text())
     rows = recorded(run / "recording.rrd")
@@ -266,7 +266,7 @@ def test_without_a_closure_there_is_nothing_to_compare(run: Path, tmp_path: Path
     assert "Merged points" not in (tmp_path / "page.html").read_text()
 
 
-def test_symmetries_are_told_by_their_axes() -> None:
+def test_symmetries_are_named_by_their_axes() -> None:
     up = np.array([0.0, -1.0, 0.0])
     quarters = tuple(se3.exp(np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0])) for turn in (np.pi / 2, np.pi, -np.pi / 2))
     flips = tuple(
@@ -384,7 +384,7 @@ def test_the_command_writes_the_page_and_says_where(run: Path, tmp_path: Path, c
 
 
 @pytest.mark.usefixtures("_undrawn")
-def test_modes_what_a_pair_leaves_open_and_both_names_of_joined_runs_are_told(run: Path, tmp_path: Path) -> None:
+def test_modes_what_a_pair_leaves_open_and_both_names_of_joined_runs_are_reported(run: Path, tmp_path: Path) -> None:
     report = json.loads((run / "report.json").read_bytes())
     edge = report["edges"][0]
     mode = {key: edge[key] for key in ("target_from_source", "covariance")}

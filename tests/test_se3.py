@@ -50,19 +50,19 @@ def test_poses_are_rigid_motions(pose: se3.Array) -> None:
 
 @LAWS
 @given(poses())
-def test_rigid_motions_are_told_from_other_matrices(pose: se3.Array) -> None:
-    def told(matrix: se3.Array) -> bool:
+def test_rigid_motions_are_distinguished_from_other_matrices(pose: se3.Array) -> None:
+    def stated(matrix: se3.Array) -> bool:
         return se3.is_rigid(matrix, tolerance=1e-6, farthest_m=11.0)
 
-    assert told(pose)
+    assert stated(pose)
     for place in np.ndindex(4, 4):
         for wrong in (np.nan, np.inf, pose[place] + 30.0):
             spoilt = pose.copy()
             spoilt[place] = wrong
-            assert not told(spoilt)
-    assert not told(pose @ np.diag([1.0, 1.0, -1.0, 1.0]))  # a mirror
-    assert not told(pose @ np.diag([1.001, 1.001, 1.001, 1.0]))
-    assert not told(np.zeros((4, 4)))
+            assert not stated(spoilt)
+    assert not stated(pose @ np.diag([1.0, 1.0, -1.0, 1.0]))  # a mirror
+    assert not stated(pose @ np.diag([1.001, 1.001, 1.001, 1.0]))
+    assert not stated(np.zeros((4, 4)))
 
 
 @LAWS

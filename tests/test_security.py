@@ -1,4 +1,4 @@
-"""Inputs cannot make the program run their code, write where it was not told to, or speak to the terminal."""
+"""Inputs cannot make the program run their code, write where it was not asked to, or speak to the terminal."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def test_nothing_is_unpickled_and_no_text_is_run(path: Path) -> None:
             continue
         called = ast.unparse(node.func)
         assert called not in ("eval", "exec", "compile", "os.system", "os.popen")
-        told = {word.arg: ast.unparse(word.value) for word in node.keywords}
-        assert told.get("shell", "False") == "False"
-        assert told.get("allow_pickle", "False") == "False"
+        given = {word.arg: ast.unparse(word.value) for word in node.keywords}
+        assert given.get("shell", "False") == "False"
+        assert given.get("allow_pickle", "False") == "False"
         if called == "np.load":
-            assert told["allow_pickle"] == "False"
+            assert given["allow_pickle"] == "False"
 
 
 def everything(root: Path, but: Path) -> set[Path]:
@@ -46,7 +46,7 @@ def everything(root: Path, but: Path) -> set[Path]:
     return {path for path in root.rglob("*") if not path.is_relative_to(but)}
 
 
-def test_outputs_stay_where_they_are_told_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_outputs_stay_where_they_are_asked_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     deep = tmp_path / "a" / "b" / "c" / "d" / "e"
     deep.mkdir(parents=True)
     source, out = deep / "in", deep / "out"

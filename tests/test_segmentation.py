@@ -311,9 +311,9 @@ def test_masks_that_hold_the_table_as_well_are_unsure(rng):
         rows, columns = (slice(found.min() - 12, found.max() + 13) for found in np.nonzero(mask))
         box = np.zeros_like(mask)
         box[rows, columns] = True
-        told = [Segmenter().segment(replace(frame, mask=one), Scene()) for one in (mask, box)]
-        assert [one.outcome for one in told] == [Outcome.CONVERGED, Outcome.UNSURE_MASK]
-        np.testing.assert_array_equal(told[1].mask, box)  # it is kept all the same
+        given = [Segmenter().segment(replace(frame, mask=one), Scene()) for one in (mask, box)]
+        assert [one.outcome for one in given] == [Outcome.CONVERGED, Outcome.UNSURE_MASK]
+        np.testing.assert_array_equal(given[1].mask, box)  # it is kept all the same
 
 
 def test_masks_that_leave_the_rim_out_are_kept(rng):

@@ -115,8 +115,8 @@ def test_what_is_known_of_the_camera_decides_the_scale_of_its_depth(
     known: str | None, depth_scale: float, sigma: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: Path
 ) -> None:
     """A loop tells the product of two factors, of the focal length and of the depth's relief."""
-    told = FocalLength(float(np.log(0.9025)), 0.01, 0.05, 1, 5.0, 1.0, {})
-    monkeypatch.setattr(FocalCalibrator, "estimate", lambda *_: told)
+    given = FocalLength(float(np.log(0.9025)), 0.01, 0.05, 1, 5.0, 1.0, {})
+    monkeypatch.setattr(FocalCalibrator, "estimate", lambda *_: given)
     run, file = tmp_path / "run", tmp_path / "camera.json"
     assert main(["build", str(scene), "--out", str(run), "--prior", "table", "--method", "icp", "--frames", "0:2"]) == 0
     options = [] if known is None else ["--known", known]

@@ -147,14 +147,14 @@ def test_new_surface_grows_with_the_turn_and_the_pose_gets_less_certain(box: Bel
 
 def test_no_action_takes_knowledge_away_and_odds_fall_with_the_turn(box: Belief) -> None:
     found = [box.predict(Candidate("turn", turn_deg=turn)) for turn in (5.0, 20.0, 45.0, 70.0, 95.0)]
-    told = [each for each in found if each is not None]
-    assert len(told) == len(found)
-    assert all(min(each.pose_nats, each.surface_nats, each.gain_nats, each.mode_nats) >= 0.0 for each in told)
-    assert all(0.0 <= each.right <= each.usable <= 1.0 for each in told)
-    odds = [each.usable for each in told]
+    given = [each for each in found if each is not None]
+    assert len(given) == len(found)
+    assert all(min(each.pose_nats, each.surface_nats, each.gain_nats, each.mode_nats) >= 0.0 for each in given)
+    assert all(0.0 <= each.right <= each.usable <= 1.0 for each in given)
+    odds = [each.usable for each in given]
     assert odds == sorted(odds, reverse=True)
     assert odds[0] > 0.98
-    for each in told:
+    for each in given:
         assert all(edge.masses.sum() == pytest.approx(1.0) for edge in each.edges)
 
 
@@ -177,7 +177,7 @@ def test_a_view_of_a_body_of_revolution_may_be_placed_at_many_turns(box: Belief,
     assert mass_within(can.predict(turn), 20.0) < 0.6
 
 
-def test_colours_that_told_the_spin_are_expected_to_tell_it_again() -> None:
+def test_colours_that_determined_the_spin_are_expected_to_do_so_again() -> None:
     turn = Candidate("turn", turn_deg=25.0)
     plain, printed = shown("can+plain", [0.0, 25.0], colour=True), shown("can+labelled", [0.0, 25.0], colour=True)
     assert shown("can+labelled", [0.0]).predictor.colour is None

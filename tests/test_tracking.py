@@ -189,10 +189,10 @@ def test_what_the_images_contradict_within_assumed_limits_is_looked_for_beyond(
 def of_modes(*modes: tuple[float, float]) -> Posterior:
     """Return a posterior of modes: weights, and turns in degrees."""
     poses = [turned(deg) for _, deg in modes]
-    told = tuple(Mode(weight, PoseGaussian(pose, COVARIANCE)) for (weight, _), pose in zip(modes, poses, strict=True))
+    stated = tuple(Mode(weight, PoseGaussian(pose, COVARIANCE)) for (weight, _), pose in zip(modes, poses, strict=True))
     shares = np.array([weight for weight, _ in modes])
     return Posterior(
-        1, 0, pooled(told), Outcome.AMBIGUOUS, 0.8, np.stack(poses), shares, told, log_marginal_likelihood=-20.0
+        1, 0, pooled(stated), Outcome.AMBIGUOUS, 0.8, np.stack(poses), shares, stated, log_marginal_likelihood=-20.0
     )
 
 

@@ -235,7 +235,7 @@ def test_a_tilted_object_contradicts_its_table() -> None:
 
 
 @pytest.mark.parametrize(("step_deg", "alone", "together"), [(25.3, True, True), (28.5, True, False)])
-def test_a_step_told_wrongly_shows_in_all_pairs_together(step_deg: float, alone: bool, together: bool) -> None:
+def test_a_step_given_wrongly_shows_in_all_pairs_together(step_deg: float, alone: bool, together: bool) -> None:
     angles_deg = [-step_deg * k for k in range(13)]
     views, poses = views_of(angles_deg), poses_of(angles_deg)
     edges = [joined(k, k - 1, poses) for k in range(1, 13)]

@@ -263,7 +263,7 @@ def test_the_camera_stands_where_its_pose_says(run: list[Step], recording: Recor
     assert len(drawn(recording, entities.CAMERAS, "strips")[COUNT - 1]) == COUNT - 1
 
 
-def test_edges_are_told_apart(run: list[Step], recording: Recording) -> None:
+def test_edges_are_distinguished(run: list[Step], recording: Recording) -> None:
     last = run[-1]
     for path, kind, accepted in (
         (entities.ODOMETRY, "odometry", True),

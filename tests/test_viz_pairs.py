@@ -194,7 +194,7 @@ def test_the_last_words_tell_by_how_much_the_loop_was_open(run: list[Step], reco
     assert f"has a closure error of {opened}" in recording[entities.NOW][last.frame.index]["text"][0]
 
 
-def test_what_the_graph_leaves_to_the_modes_of_a_pair_is_told(run: list[Step]) -> None:
+def test_what_the_graph_leaves_to_the_modes_of_a_pair_is_reported(run: list[Step]) -> None:
     step = run[1]
     pair = (step.edges[0].source, step.edges[0].target)
     wary = replace(step, solution=replace(step.solution, mode_weights={pair: np.array([0.9, 0.1])}))
