@@ -231,7 +231,7 @@ def reopened(run: Path, moved: Sequence[Path] = (), announce: Callable[[str], No
     Args:
         run: run folder.
         moved: where its sequence is now, of joined runs all of theirs in order; none: where they were.
-        announce: receives in words what follows, once the sequence is found.
+        announce: receives in words what follows, once first and last frames are found to be those of the run.
 
     Raises:
         InputError: if the folder holds no finished run, or a sequence is not to be found or is another.
@@ -240,6 +240,8 @@ def reopened(run: Path, moved: Sequence[Path] = (), announce: Callable[[str], No
     poses = {frame: pose.mean for frame, pose in poses_of(report).items()}
     if not poses:
         raise InputError(f"{run}: no frame was accepted; build the run again")
+    for part in parts:
+        part.check()
     total_s = (report.get("seconds") or {}).get("total")
     took = "" if total_s is None else f"; the build took {total_s:.0f} s"
     announce(f"preparing {len(poses)} frames again{took}")
