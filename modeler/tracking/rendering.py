@@ -21,10 +21,7 @@ _MARGIN = 0.35  # of a rendered image beside the model, as a share of the model'
 FINE_PX, COARSE_PX = 200.0, 64.0
 """Width of the model in a rendered image at most: finer ones do not make poses more precise; enough for a search."""
 _FAR = 100.0  # times the object's distance: depth beside a model, where nothing is
-_MISSING_SHARE = (
-    0.25  # of the surface of a closed model: a cube lacks a sixth without the side it stood on, half a ball
-)
-# a third, of which much may go on beside the outline
+_MISSING_SHARE = 0.33  # of a closed model's surface; half a ball, as what was seen from one side, lacks a third
 
 
 @final
