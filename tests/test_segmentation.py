@@ -353,15 +353,15 @@ def test_beyond_the_greatest_depth_is_no_object(rng):
         assert not np.any(one.mask & (frame.depth_m > 0.85))
 
 
-def test_an_object_cut_off_by_the_image_is_no_doubt(rng):
-    """It is modelled as far as it is seen."""
+def test_an_object_cut_off_by_the_image_is_named(rng):
+    """It is modelled as far as it is seen; what the images contradict decides whether that is trusted."""
     frames = [
         World().table().box((0.42, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k).frame(k, rng)[0]
         for k in range(4)
     ]
     segmenter = Segmenter()
     scene = segmenter.scene(frames)
-    assert all(segmenter.segment(frame, scene).outcome is Outcome.CONVERGED for frame in frames)
+    assert all(segmenter.segment(frame, scene).outcome is Outcome.CUT_OFF for frame in frames)
 
 
 def test_an_object_that_grows_is_unsure_and_one_that_is_gone_has_too_few_points(rng):

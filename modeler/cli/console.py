@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from modeler.suggestion import Belief, Suggestions
-    from modeler.types import AbstractPrior, Event, Posterior, Reason, Step
+    from modeler.types import AbstractPrior, Event, Outcome, Posterior, Reason, Step
 
 T = TypeVar("T")
 
@@ -232,7 +232,7 @@ class Console:
         self._address, self._prior = address, prior
         self._placed: dict[int, bool] = {}  # a lost frame that is placed later occurs twice
         self._loops = 0
-        self._unsure: set[int] = set()
+        self._doubts: dict[Outcome, set[int]] = {}  # frames by what is doubtful about their masks
         self._advised: set[str] = set()
         self._reported, self._aloud = "", 0
         self._held: list[int] = []  # frames left out for the same reason as those reported last
@@ -250,15 +250,13 @@ class Console:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the bar, and report the number of frames with unsure masks."""
-        from modeler.types import Outcome
+        """Stop the bar, and report the number of frames with doubtful masks."""
         from modeler.verdict.advice import outcome_advice
 
         self._bar.stop()
         self._release()
-        if self._unsure:
-            doubt = Outcome.UNSURE_MASK
-            self._say(f"{len(self._unsure)} of {len(self._placed)} frames: {doubt.label}: {outcome_advice(doubt)}")
+        for doubt, frames in self._doubts.items():
+            self._say(f"{len(frames)} of {len(self._placed)} frames: {doubt.label}: {outcome_advice(doubt)}")
 
     @property
     def watched(self) -> bool:
@@ -300,8 +298,9 @@ class Console:
         loops = self._loops
         frame, accepted = step.frame.index, step.accepted
         before, self._placed[frame] = self._placed.get(frame), accepted
-        if accepted and step.segmentation.outcome is Outcome.UNSURE_MASK:
-            self._unsure.add(frame)
+        mask = step.segmentation.outcome
+        if accepted and mask in (Outcome.UNSURE_MASK, Outcome.CUT_OFF):
+            self._doubts.setdefault(mask, set()).add(frame)
         self._expect()
         self._state = f"{len(step.views)} joined, {loops} {'loop' if loops == 1 else 'loops'} closed"
         self._bar.update(self._task, completed=len(self._placed), total=self._frames, description=self._state)

@@ -65,7 +65,7 @@ def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) ->
         sensor: of the camera.
     """
     segmentation = segmenter.segment(frame, scene)
-    if segmentation.outcome not in (Outcome.CONVERGED, Outcome.UNSURE_MASK):
+    if segmentation.outcome not in (Outcome.CONVERGED, Outcome.UNSURE_MASK, Outcome.CUT_OFF):
         return Prepared(frame, segmentation, None)
     view = sensor.ray_image(replace(frame, mask=segmentation.mask), segmentation.plane)
     return Prepared(frame, segmentation, view if len(view.points_m) else None)

@@ -137,7 +137,8 @@ class Segmenter:
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * AREA_FACTOR
-        return Segmentation(mask, scene.plane, Outcome.CONVERGED if sure else Outcome.UNSURE_MASK)
+        whole = Outcome.CUT_OFF if is_cut(mask, scene) else Outcome.CONVERGED
+        return Segmentation(mask, scene.plane, whole if sure else Outcome.UNSURE_MASK)
 
     def _looks(self, frames: Sequence[Frame], scene: Scene) -> tuple[list[_Look], list[_Look]]:
         """Return frames with the object found in them; and those where it does not lead out of view, if at least half.

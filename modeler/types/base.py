@@ -39,6 +39,10 @@ class Outcome(enum.Enum):
         "The object is hard to segment; give a region of interest, a largest depth, or masks that hold only the "
         "object.",
     )
+    CUT_OFF = (
+        "cut off by the image",
+        "The object, or an arm that is taken for part of it, leaves the image; check the masks in the report.",
+    )
     NOT_APPLICABLE = (
         "prior does not apply",
         "These views lack what the prior needs; show it to the camera, or use another prior.",

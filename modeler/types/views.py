@@ -207,7 +207,7 @@ class Segmentation:
     plane: Plane | None
     """The support plane, where one is seen."""
     outcome: Outcome
-    """CONVERGED, or UNSURE_MASK / TOO_FEW_POINTS where a person should look."""
+    """CONVERGED, or UNSURE_MASK / CUT_OFF / TOO_FEW_POINTS where a person should look."""
 
 
 COLOUR_SHIFT_PX = 0.5
