@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -48,6 +49,14 @@ def test_poses_are_those_of_the_truth_but_for_symmetries(track: Path) -> None:
 
 TURNS = [np.diag([*signs, np.prod(signs), 1.0]) for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))]
 """Half turns of a box about its axes."""
+
+
+def test_a_page_shows_every_frame_with_the_model_outlined(track: Path) -> None:
+    page = (track / "report.html").read_text()
+    assert "In every frame the object was placed" in page
+    assert page.count("<img src='data:image/jpeg;base64,") == 3
+    assert page.count("<tr><td>") == 3
+    assert not re.findall(r"(src|href)=['\"]?(?!data:)\w", page)
 
 
 def test_trajectory_and_results_of_bop_hold_the_same_poses(track: Path) -> None:

@@ -138,7 +138,9 @@ class Track:
             InputError: if a frame cannot be read or a file cannot be written.
         """
         from modeler.cli.reading import reading, while_it_lasts
+        from modeler.runs.tracks import PAGE
         from modeler.viz import blueprint, tracking_view
+        from modeler.viz.report.track import write_track_page
         from modeler.viz.stream import open_stream
 
         facts = {"model": folder.model, "sequence": folder.sequence, "seed": self.seed}
@@ -160,6 +162,7 @@ class Track:
         finally:
             stream.close()
         folder.write(found, last=True)
+        write_track_page(folder.path, folder.path / PAGE, tracker.renderer.centre_m)
         return found
 
 

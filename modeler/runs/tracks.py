@@ -17,7 +17,9 @@ from modeler.types import InputError, PoseGaussian
 
 POSES: Final = "poses.json"
 """The file by which a folder is known."""
-FILES: Final = (POSES, "trajectory.txt", "bop.csv", "recording.rrd")
+PAGE: Final = "report.html"
+"""The page about a track."""
+FILES: Final = (POSES, "trajectory.txt", "bop.csv", "recording.rrd", PAGE)
 
 
 @final

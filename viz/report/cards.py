@@ -78,7 +78,7 @@ def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[s
         result: the run.
         pictures: by frame number.
     """
-    cards, contradicted = [], result.report.get("contradicted") or {}
+    parts, contradicted = [], result.report.get("contradicted") or {}
     for frame in result.report["frames"]:
         shown = pictures.get(frame["id"])
         if shown is not None and shown.masked is not None:
@@ -86,11 +86,7 @@ def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[s
             words = [str(frame["id"]), *(["unsure"] if unsure else [])]
             words += [] if frame["outcome"] == ACCEPTED else ["left out"]
             words += ["contradicted"] if str(frame["id"]) in contradicted else []
-            cards.append(
-                f"<div class='mask{' no' if len(words) > 1 else ''}'><button type='button'>"
-                f"<img src='{data_address(shown.masked, 'jpeg')}' alt='frame {frame['id']}'></button>"
-                f"<p>{', '.join(words)}</p></div>"
-            )
+            parts.append(outlined_card(frame["id"], shown.masked, words[1:]))
     note = (
         "The segmented object in each frame; a click enlarges it. The outline should follow the object all around: "
         "anything else inside becomes part of the model, anything outside is missing. Unsure: the object could not be "
@@ -103,10 +99,24 @@ def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[s
             "where this frame sees through the surface of others. At outlines, masks include more than the object; all "
             "over, a pose is wrong."
         )
+    return outlined_cards("Masks", note, parts)
+
+
+def outlined_card(frame: int, picture: bytes, doubts: Sequence[str]) -> str:
+    """Return a frame with the object outlined, and what is doubtful about it."""
+    return (
+        f"<div class='mask{' no' if doubts else ''}'><button type='button'>"
+        f"<img src='{data_address(picture, 'jpeg')}' alt='frame {frame}'></button>"
+        f"<p>{escape(', '.join([str(frame), *doubts]))}</p></div>"
+    )
+
+
+def outlined_cards(title: str, note: str, cards: Sequence[str]) -> Sequence[str]:
+    """Return frames, each from `outlined_card`, which a click enlarges; nothing without frames."""
     if not cards:
         return []
     return [
-        f"<h2>Masks</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"
+        f"<h2>{title}</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"
         f"<dialog id='large'></dialog><script>{_ENLARGE}</script>"
     ]
 
@@ -240,11 +250,30 @@ def thumbnails(rows: Mapping[str, Mapping[int, Row]], report: Mapping[str, Any])
     return {
         frame: _of_frame(
             {path: rows[path].get(frame, {}) for path in FRAME_PATHS},
-            _MASK_SIZE if frame in doubtful or len(frames) <= _MANY else _SIZE,
+            size_px(len(frames), doubtful=frame in doubtful),
             marks.get(frame),
         )
         for frame in frames
     }
+
+
+def size_px(frames: int, *, doubtful: bool) -> tuple[int, int]:
+    """Return height and width of a frame's picture, of so many: of many, only doubtful ones are large."""
+    return _MASK_SIZE if doubtful or frames <= _MANY else _SIZE
+
+
+def with_outline(rows: Mapping[str, Mapping[int, Row]], frame: int, size: tuple[int, int]) -> bytes | None:
+    """Return the part of a recorded frame around the outlined object as JPEG; None without a picture.
+
+    Args:
+        rows: of the recording, as `recorded` returns them.
+        frame: its number.
+        size: height and width in px.
+    """
+    seen, depth, mask = (
+        _picture(rows[path].get(frame, {})) for path in (entities.COLOUR, entities.DEPTH, entities.MASK)
+    )
+    return _outlined(depth if seen is None else seen, mask, size)
 
 
 def _of_frame(rows: Mapping[str, Row], mask_size: tuple[int, int], marks: Marks | None) -> Thumbnails:

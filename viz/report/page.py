@@ -56,7 +56,7 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     parts += [*_closure(result, rows), *_accuracy(result, centre_m), *mask_cards(result, pictures)]
     parts += pair_cards(result, pictures, centre_m)
     parts.append(_settings(result))
-    page = Template(_asset("page.html")).substitute(
+    page = Template(asset("page.html")).substitute(
         title=escape(f"{_name(result)}: model report"), body="\n".join(parts)
     )
     write_atomically(out, page)
@@ -152,7 +152,7 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
         "zoom, Shift and drag to pan, double-click to reset. Back faces of open surfaces are reddish.</figcaption>"
         "</figure>",
         f"<script type='application/json' id='scene'>{data}</script>",
-        f"<script>{_asset('mesh_viewer.js')}</script>",
+        f"<script>{asset('mesh_viewer.js')}</script>",
     ]
 
 
@@ -289,7 +289,8 @@ def _scale() -> str:
     return f"0 <i style='background:linear-gradient(90deg,{stops})'></i>"
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Return the text of a file that pages are made of."""
     return (resources.files("modeler.viz.report") / name).read_text(encoding="utf-8")
 
 
