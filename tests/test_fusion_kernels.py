@@ -10,6 +10,7 @@ from modeler import se3
 from modeler.fusion import meshing
 from modeler.fusion.meshing import DistanceField, VoxelGrid
 from modeler.kernels import marching_cubes, occupancy, point_clouds, tsdf
+from modeler.kernels import votes as sides
 
 
 def test_thinning_puts_points_of_one_voxel_together(rng):
@@ -65,12 +66,12 @@ def test_a_pixel_that_hangs_in_the_air_has_no_surfel():
 
 
 def naive_side(votes, remaining, tau_m):
-    """Twin of `tsdf.dominant_vote`."""
+    """Twin of `votes.dominant_vote`."""
     score = {k: votes[k][1] * (1.01 - abs(votes[k][0]) / tau_m) for k in remaining}
     best = max(remaining, key=lambda k: score[k])
     if votes[best][0] >= 0:
         return best
-    rivals = [k for k in remaining if votes[k][0] > 0 and votes[k][2] @ votes[best][2] < tsdf.SAME_SIDE]
+    rivals = [k for k in remaining if votes[k][0] > 0 and votes[k][2] @ votes[best][2] < sides.SAME_SIDE]
     rivals = [k for k in rivals if score[k] > 0.3 * score[best]]
     return max(rivals, key=lambda k: score[k], default=best)
 
@@ -89,7 +90,7 @@ def naive_wall(voxel, vote, other, views):
     if not (0 <= row < index.shape[1] and 0 <= column < index.shape[2]):
         return False
     n = index[f, row, column]
-    return n >= 0 and normals[n] @ normal > tsdf.SAME_SIDE and abs(normals[n] @ (crossing - points[n])) < -along
+    return n >= 0 and normals[n] @ normal > sides.SAME_SIDE and abs(normals[n] @ (crossing - points[n])) < -along
 
 
 def naive_integrate(voxels, tau_m, empty_weight, voxel_m, views):
@@ -114,23 +115,23 @@ def naive_integrate(voxels, tau_m, empty_weight, voxel_m, views):
         values[number], totals[number] = (tau_m, emptiness) if emptiness else (0.0, 0.0)
         while remaining:
             best = naive_side(votes, remaining, tau_m)
-            side = [k for k in remaining if votes[k][2] @ votes[best][2] > tsdf.SAME_SIDE]
+            side = [k for k in remaining if votes[k][2] @ votes[best][2] > sides.SAME_SIDE]
             weight = sum(votes[k][1] for k in side)
             distance = sum(votes[k][1] * votes[k][0] for k in side) / weight
             scale_m = max(2.385 / 2**0.5 * (tau_m - 3 * voxel_m) / 2, 0.1 * voxel_m)
-            for _ in range(tsdf.ROBUST_ROUNDS):
+            for _ in range(sides.ROBUST_ROUNDS):
                 shares = {k: votes[k][1] / (1 + ((votes[k][0] - distance) / scale_m) ** 2) for k in side}
                 distance = sum(shares[k] * votes[k][0] for k in side) / sum(shares.values())
-            opposite = [k for k in remaining if votes[k][2] @ votes[best][2] < -tsdf.SAME_SIDE]
+            opposite = [k for k in remaining if votes[k][2] @ votes[best][2] < -sides.SAME_SIDE]
             if opposite:
                 behind = sum(votes[k][1] * votes[k][0] for k in opposite) / sum(votes[k][1] for k in opposite)
-                if -2 * tsdf.THINNEST * voxel_m < distance + behind < tau_m - 2 * voxel_m:
-                    distance = abs(distance - behind) / 2 - tsdf.THINNEST * voxel_m
-            excess = max(0.0, emptiness - tsdf.OUTWEIGHED * weight)
+                if -2 * sides.THINNEST * voxel_m < distance + behind < tau_m - 2 * voxel_m:
+                    distance = abs(distance - behind) / 2 - sides.THINNEST * voxel_m
+            excess = max(0.0, emptiness - sides.OUTWEIGHED * weight)
             totals[number] = weight + excess
             values[number] = (excess * tau_m + weight * distance) / totals[number]
             against = [k for k in remaining if k not in side and naive_wall(voxel, votes[best], votes[k], views)]
-            if len(against) < tsdf.MAJORITY * len(side):
+            if len(against) < sides.MAJORITY * len(side):
                 break
             remaining = [k for k in remaining if k not in side]
             values[number], totals[number] = tau_m, emptiness
@@ -174,7 +175,7 @@ def test_integration_is_its_twin(seed, one_mind, turned_rad, monkeypatch):
     assert 0.0 < (expected_totals > 0.0).mean() <= 1.0
     np.testing.assert_allclose(totals.ravel(), expected_totals, rtol=1e-5)
     np.testing.assert_allclose(values.ravel(), expected_values, rtol=1e-4, atol=1e-8)
-    monkeypatch.setattr(tsdf, "MAJORITY", 1000)  # of the twin alone
+    monkeypatch.setattr(sides, "MAJORITY", 1000)  # of the twin alone
     if one_mind:  # some votes were rejected
         assert np.any(naive_integrate(voxels, tau_m, 0.3, voxel_m, views)[1] != expected_totals)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from modeler.kernels.cache import njit
 from modeler.kernels.threads import over_rows
-from modeler.kernels.tsdf import project
+from modeler.kernels.votes import project
 
 
 def observation_counts(origin, cell_m, shape, margin_m, free_m, poses, intrinsics, planes):

@@ -462,9 +462,8 @@ class Run:
         return (state if focal.log_factor == at else state.under(focal.log_factor - at, sensor)), focal
 
     def _step(self, prepared: Prepared, posteriors: Sequence[Posterior], edges: Sequence[Edge]) -> Step:
-        """Return the event of a processed frame."""
+        """Return the event of a processed frame, with the views that it was registered to, which pictures show."""
         views, solution, ready = self.state.views, self.state.solution, self.state.ready
-        # The views that were registered are passed on, so that they need not be recomputed to draw a pair.
         compared = {posterior.target: ready[posterior.target] for posterior in posteriors if posterior.target in ready}
         step = Step(
             frame=prepared.frame,
