@@ -36,7 +36,7 @@ class Track:
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
     """A sequence in any format that `modeler build` takes; realsense: for a connected camera."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder to create: poses.json, trajectory.txt, bop.csv and recording.rrd."""
+    """Folder to create: poses.json, trajectory.txt, bop.csv, recording.rrd and report.html."""
     unit: Annotated[Literal["m", "cm", "mm"] | None, default("m; mm beside a models_info.json")] = None
     """Unit of lengths in a mesh file."""
     independent: bool = False

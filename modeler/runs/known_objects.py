@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
 
@@ -13,11 +13,10 @@ from modeler.export import RunFolder, read_model
 from modeler.export.bop import MODELS_INFO
 from modeler.sequences import AbstractSequence, FocalFactor, RefocusedSequence
 from modeler.system.regular_files import read_regular
+from modeler.tracking.tracker import UNITS_M
 from modeler.types import InputError, ObjectModel
 
 Unit = Literal["m", "cm", "mm"]
-UNITS_M: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Metres in a unit of length."""
 _ALIKE = 1e-3  # relative difference of focal lengths of one camera: files have rounded values
 
 

@@ -45,13 +45,14 @@ Presence = Literal["found", "followed", "not there", "too few points"]
 
 USABLE_RAD, USABLE_M = np.radians(3.0), 0.005
 """Largest standard deviations, of a rotation and of the object's place, with which a pose is of use."""
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Metres in a unit of length."""
 
 _SIGMA_RAD, _SIGMA = 0.12, 0.15  # of a pose found by the search: rotation, and shift in units of the object's size
 _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames before
 _MOST_STEPS = 3.0  # over which a velocity is extrapolated
 _OVERLAP, _SHOWN = 0.6, 0.3  # least, with any rotation: a small part of a model looks like many things
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
-_UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
 _MOST_TRIED = 3  # of the segments of a frame, the likeliest
 _RIVAL_NATS = 12.0  # below the best pose, a search's pose is negligible
@@ -302,7 +303,7 @@ class Tracker:
         ratio = self.renderer.radius_m / (2.0 * view.size_m)
         if 1.0 / _UNIT < ratio < _UNIT:
             return
-        unit = min(_UNITS_M, key=lambda name: abs(np.log(ratio * _UNITS_M[name])))
+        unit = min(UNITS_M, key=lambda name: abs(np.log(ratio * UNITS_M[name])))
         raise InputError(
             f"the model is {2.0 * self.renderer.radius_m:.3g} m across, and the object in frame {view.index} about "
             f"{4.0 * view.size_m:.2g} m; if the model's lengths are in {unit}, give `unit` {unit}"

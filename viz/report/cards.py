@@ -270,20 +270,22 @@ def with_outline(rows: Mapping[str, Mapping[int, Row]], frame: int, size: tuple[
         frame: its number.
         size: height and width in px.
     """
-    seen, depth, mask = (
-        _picture(rows[path].get(frame, {})) for path in (entities.COLOUR, entities.DEPTH, entities.MASK)
-    )
-    return _outlined(depth if seen is None else seen, mask, size)
+    return _outlined(*_shown({path: rows[path].get(frame, {}) for path in FRAME_PATHS}), size)
 
 
 def _of_frame(rows: Mapping[str, Row], mask_size: tuple[int, int], marks: Marks | None) -> Thumbnails:
-    seen, depth, mask = (_picture(rows[path]) for path in (entities.COLOUR, entities.DEPTH, entities.MASK))
-    shown = depth if seen is None else seen
+    shown, mask = _shown(rows)
     outlined, masked = _outlined(shown, mask, _SIZE), _outlined(shown, mask, mask_size, marks)
     target, before, after = (cloud(rows[p]) for p in (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER))
     if target is None or before is None or after is None:
         return Thumbnails(outlined, None, None, masked)
     return Thumbnails(outlined, _pair_picture(target, before), _pair_picture(target, after), masked)
+
+
+def _shown(rows: Mapping[str, Row]) -> tuple[Image.Image | None, Image.Image | None]:
+    """Return the picture of a frame, in colour or else depth, and the object's mask; None where there is none."""
+    seen, depth, mask = (_picture(rows[path]) for path in (entities.COLOUR, entities.DEPTH, entities.MASK))
+    return depth if seen is None else seen, mask
 
 
 def _picture(row: Row) -> Image.Image | None:
