@@ -31,7 +31,7 @@ INTERRUPTED = 130
 _AGAIN_S = 0.05  # until a signal is sent again that arrived where nothing can be raised
 _PAIRS_TIMED = 3  # until it is said how long all takes
 _WHOLE = 2.6  # a build takes so many times its pass over the frames: 2.4 for the bundled box, 2.75 for the capture cap
-_WORTH_SAYING_S = 20.0
+_WORTH_SAYING_S = 20.0  # what takes less is over soon after the first pairs
 _PULSE_S = 30.0  # between signs of life where there is no bar
 _ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
@@ -238,7 +238,7 @@ class Console:
         self._held: list[int] = []  # frames left out for the same reason as those reported last
         self._state, self._enough = "", False
         self._began_s: float | None = None
-        self._told_s = time.monotonic()
+        self._said_s = time.monotonic()
 
     def __enter__(self) -> Console:
         """Show the bar."""
@@ -323,7 +323,7 @@ class Console:
             whole_s = _WHOLE * (now_s - self._began_s) / _PAIRS_TIMED * self._frames
             if whole_s > _WORTH_SAYING_S:
                 self._say(f"{self._frames} frames: to register, close loops and fuse takes about {_rounded(whole_s)}")
-        elif not self.watched and now_s - self._told_s > _PULSE_S:
+        elif not self.watched and now_s - self._said_s > _PULSE_S:
             self._say(f"frame {done} of {self._frames}")
 
     def _show_stage(self, stage: str, done: int, total: int) -> None:
@@ -331,7 +331,7 @@ class Console:
         if stage != self._stage:
             self._stage = stage
             self._say(stage, logging.DEBUG)
-        elif total > 1 and not self.watched and time.monotonic() - self._told_s > _PULSE_S:
+        elif total > 1 and not self.watched and time.monotonic() - self._said_s > _PULSE_S:
             self._say(f"{stage}: {done} of {total}")
             self._bar.update(self._task, total=None, description=stage)  # forgets how fast the stage before went
         self._bar.update(self._task, completed=done, total=total, description=stage)
@@ -369,6 +369,6 @@ class Console:
     def _say(self, text: str, level: int = logging.INFO) -> None:
         line = as_options(text)
         if MESSAGES.note(line, level):
-            self._told_s = time.monotonic()
+            self._said_s = time.monotonic()
             with lost_without_harm():
                 self._bar.console.print(f"modeler: {line}", markup=False)
