@@ -22,7 +22,7 @@ from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.runs.outputs import check_run_folder
-from modeler.segmentation import Segmenter
+from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import AbstractSequence, GivenSequence, KeptSequence, open_sequence
 from modeler.types import (
     AbstractPrior,
@@ -184,7 +184,8 @@ def build(
         advice=partial(_advice, modeler.prior),
     )
     closure_expected = comes_back(frames, modeler.prior, modeler.closer.max_angle_deg)
-    scene = compose.scene(modeler, frames)
+    meta = replace(meta, scene_frames=scene_frames(frames.indices))
+    scene = compose.scene(modeler, frames, meta.scene_frames)
     last: Step | None = None
     with nullcontext() if folder is None else _recorded(folder, meta, frames.name, began_s, overwrite) as record:
         for event in modeler.run(frames, scene, closure_expected=closure_expected, live=frames.live):

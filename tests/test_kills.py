@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,9 +20,10 @@ from modeler.baselines import IcpRegistrar
 from modeler.cli import build, main
 from modeler.export import PairCache, Pairs, RunFolder, RunMeta, locked
 from modeler.priors import GeneralPrior
-from modeler.sequences import bundled, open_sequence
-from modeler.types import InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage, ViewPair
+from modeler.sequences import bundled, open_sequence, write_bop
+from modeler.types import Frame, InputError, Mode, Outcome, PoseGaussian, Posterior, RayImage, ViewPair
 from modeler.views import Sensor
+from studies.formats.image_folders import small_frames, small_truth
 from studies.kills.commands import COMMANDS, CommandTrials, write_inputs
 from studies.kills.trials import KINDS, SAME, Trials
 
@@ -142,9 +144,9 @@ def test_a_run_that_other_versions_began_is_registered_anew(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    folder, drop, version = tmp_path / "run", Pairs.drop, metadata.version
+    folder, version = tmp_path / "run", metadata.version
     with monkeypatch.context() as patch:
-        patch.setattr(Pairs, "drop", lambda pairs: None if pairs.folder.is_dir() else drop(pairs))
+        patch.setattr(Pairs, "complete", lambda pairs: None)
         patch.setattr(metadata, "version", lambda name: "0.0.1" if name in ("modeler", "numpy") else version(name))
         assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 0
     assert len(list((folder / ".pairs").iterdir())) == len(pairs_of(whole))
@@ -154,6 +156,42 @@ def test_a_run_that_other_versions_began_is_registered_anew(
     assert "modeler 0.0.1, numpy 0.0.1" in capsys.readouterr().err
     assert set(asked) == pairs_of(whole)
     assert contents(folder) == contents(whole)
+
+
+@pytest.mark.parametrize("through", ["build", "batch"])
+def test_only_pairs_of_new_or_changed_frames_are_registered(tmp_path: Path, through: str) -> None:
+    """Frames are compared by their content, and named."""
+    frames, folder, run = small_frames(5), tmp_path / "s", tmp_path / "runs" / "s"
+    command = [sys.executable, "-m", "modeler", through, str(folder), "--prior", "table", "--method", "icp", "--out"]
+    command += [str(run), "--resume"] if through == "build" else [str(run.parent)]
+
+    def pairs_after(kept: list[Frame]) -> tuple[set[tuple[int, int]], str]:
+        """Return the pairs that were registered for some frames, and what was said."""
+        before = {path.name for path in run.glob(".pairs.done/*")}
+        shutil.rmtree(folder, ignore_errors=True)
+        write_bop(folder, kept, small_truth(5), depth_scale_mm=1.0)
+        ended = subprocess.run(command, check=False, capture_output=True, text=True)
+        assert ended.returncode in (0, 3), ended.stderr
+        log = run.parent / ".batch" / "s.log"
+        said = log.read_text() if through == "batch" else ended.stderr
+        made = {path.name for path in run.glob(".pairs.done/*")} - before
+        return {(int(name[:6]), int(name[7:13])) for name in made}, said
+
+    first, _ = pairs_after(frames[:3])
+    assert first >= {(1, 0), (2, 1)}
+    for again in range(2 if through == "build" else 1):
+        more, said = pairs_after(frames)
+        assert all(source > 2 for source, _ in more)
+        assert bool(more) == (again == 0)
+        assert ("frames 3, 4 are new" in said) == (again == 0)
+    changed = [*frames[:4], replace(frames[4], depth_m=frames[4].depth_m + np.float32(0.001))]
+    other, said = pairs_after(changed)
+    assert other
+    assert all(source == 4 for source, _ in other)
+    assert "frame 4 is changed" in said
+    none, said = pairs_after(changed[:4])
+    assert not none
+    assert "frame 4 is gone" in said
 
 
 def test_what_is_said_to_be_saved_is_on_the_disk(

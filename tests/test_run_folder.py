@@ -117,18 +117,18 @@ def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
             run.finished(other)
 
 
-def test_run_has_finished_when_its_registrations_are_forgotten(tmp_path: Path) -> None:
+def test_run_has_finished_when_its_registrations_are_those_of_a_complete_run(tmp_path: Path) -> None:
     run = RunFolder.open(tmp_path)
     for step in made_up_steps(2):
         run.write(step, META)
-        run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, "question")
+        run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, ("views", "prior"))
         assert not run.finished(META)
     run.finish()
     assert run.finished(META)
-    assert {path.name for path in tmp_path.iterdir()} == FILES - {"recording.rrd"}
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"recording.rrd"} | {".pairs.done"}
     step = made_up_steps(2)[-1]
     run.write(replace(step, verdict=judged(step, interrupted=True)), META)
-    run.pairs.keep(made_up_steps(2)[-1].edges_so_far[0].posterior, "question")
+    run.pairs.keep(made_up_steps(2)[-1].edges_so_far[0].posterior, ("views", "prior"))
     run.finish()
     assert not run.finished(META)
     assert run.pairs.folder.exists()
@@ -164,7 +164,7 @@ def test_what_no_report_tells_of_is_not_resumed(tmp_path: Path) -> None:
     run = RunFolder.open(tmp_path)
     for step in made_up_steps():
         run.write(step, META)
-    run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, "question")
+    run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, ("views", "prior"))
     (tmp_path / "report.json").unlink()
     (tmp_path / "notes.txt").write_text("mine")
     RunFolder.open(tmp_path, resume=True)
@@ -194,11 +194,13 @@ def test_a_run_with_a_damaged_report_can_be_replaced(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [".pairs"]
 
 
-def test_what_a_kill_left_of_the_registrations_goes_with_the_next_run(tmp_path: Path) -> None:
+def test_registrations_of_a_complete_run_go_with_the_run(tmp_path: Path) -> None:
     run = RunFolder.open(tmp_path)
-    run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, "question")
-    (tmp_path / ".pairs").rename(tmp_path / ".pairs.dropped")
-    assert run.is_run
+    for step in made_up_steps(2):
+        run.write(step, META)
+    run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, ("views", "prior"))
+    run.finish()
+    assert [path.name for path in (tmp_path / ".pairs.done").iterdir()] == ["000005-000003-views-prior.pair"]
     RunFolder.open(tmp_path, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == [".pairs"]
 

@@ -31,7 +31,7 @@ TRIES = 2
 """How often a sequence that fails is tried."""
 ENDED = (0, 3)
 """Statuses of completed builds."""
-Standing = Literal["new", "interrupted", "done", "changed", "failed"]
+Standing = Literal["new", "interrupted", "done", "changed", "other", "failed"]
 _CHUNK_BYTES = 1 << 20
 _NOTE_BYTES = 1 << 24  # of a note at most
 _MOST = 1 << 31  # of a number in it
@@ -195,11 +195,12 @@ def standing(job: Job, note: dict[str, Any] | None = None) -> Standing:
     complete = note.get("status") in ENDED
     if complete and not (job.run / "report.json").is_file():
         return "new"  # the run was removed
-    same = note.get("sequence") == job.sequence and note.get("arguments") == list(job.arguments)
-    if same and note.get("glance") != fingerprint(job, content=False):
+    alike = note.get("sequence") == job.sequence and note.get("arguments") == list(job.arguments)
+    same = alike
+    if alike and note.get("glance") != fingerprint(job, content=False):
         same = note.get("content") == fingerprint(job, content=True)  # copied or touched, perhaps
     if not same:
-        return "changed" if complete else "new"
+        return "new" if not complete else "changed" if alike else "other"
     if complete:
         return "done"
     return "failed" if note.get("tries", 0) >= TRIES and not job.again else "interrupted"

@@ -26,8 +26,8 @@ class Batch:
     """Build models of many sequences, each into its own run folder below DIR, and list them in DIR/models.parquet.
 
     The options of `modeler build` apply to every sequence. When repeated, the same command skips finished sequences,
-    resumes interrupted ones, and retries those that failed once. Ctrl-C, or a kill, loses only the pair in progress of
-    each sequence.
+    resumes interrupted ones and those with other frames than before, and retries those that failed once. Ctrl-C, or a
+    kill, loses only the pair in progress of each sequence.
 
     Exit status: 0 if every model can be trusted, 3 if some cannot or are missing, 2 for wrong usage.
     """
@@ -49,7 +49,7 @@ class Batch:
     workers: Annotated[int | None, tyro.conf.arg(metavar="N"), default("as cores and memory allow")] = None
     """Number of sequences at a time (Slurm: in the queue); a cluster has its own number."""
     overwrite: bool = False
-    """Build sequences again that were built with other options or from other input."""
+    """Build sequences again that were built with other options."""
     again: bool = False
     """Retry sequences that failed twice."""
     pages: bool = False
@@ -85,17 +85,22 @@ class Batch:
             jobs = _jobs(self)
             check_folder(self.out, [Path(job.sequence) for job in jobs])
             stands = {job: standing(job) for job in jobs}
-            changed = [job.name for job, how in stands.items() if how == "changed"]
-            if changed and not self.overwrite:
+            others, changed = (
+                [job.name for job, how in stands.items() if how == kind] for kind in ("other", "changed")
+            )
+            if others and not self.overwrite:
                 raise InputError(
-                    f"{self.out / changed[0]}: was built with other options or from other input, as were "
-                    f"{len(changed)} in all; give --overwrite to build these again, or choose another --out"
+                    f"{self.out / others[0]}: was built with other options, as were {len(others)} in all; give "
+                    "--overwrite to build these again, or choose another --out"
                 )
+            if changed:
+                say(f"the input of {_some(changed)} has changed since: only pairs that are new are registered")
             ends = [ended(job.name, read_note(job.note), fresh=False) for job in jobs if stands[job] in _OVER]
             waiting = [job for job in jobs if stands[job] not in _OVER]
             stand = Counter(stands.values())
             words = f"{stand['done']} done, {stand['failed']} failed twice, {stand['interrupted']} to be resumed"
-            words = f"{len(jobs)} {_sequences(len(jobs))}: {words}, {stand['new'] + stand['changed']} to be built"
+            begun = stand["new"] + stand["changed"] + stand["other"]
+            words = f"{len(jobs)} {_sequences(len(jobs))}: {words}, {begun} to be built"
             if not waiting:
                 say(words)
             elif is_here(self.executor):
@@ -109,6 +114,10 @@ class Batch:
             finally:
                 write_models(self.out)
         return _summarise(self, ends)
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
 def _sequences(count: int) -> str:

@@ -46,7 +46,8 @@ class Build:
     overwrite: bool = False
     """Replace the results of an earlier run in the folder."""
     resume: bool = False
-    """Continue an interrupted run with the same options; registered pairs are reused."""
+    """Continue a run that was interrupted, or whose frames have changed, with the same options: only pairs that are
+    new are registered."""
     watch: bool = False
     """Process frames while another program is still writing into SEQUENCE."""
     idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
@@ -74,6 +75,7 @@ class Build:
         from modeler.export import PairCache, RunFolder, RunMeta, locked
         from modeler.runs.outputs import check_run_folder
         from modeler.runs.reopening import estimated_camera
+        from modeler.segmentation import scene_frames
         from modeler.system.concurrency import in_parallel
         from modeler.viz.stream import load
 
@@ -96,13 +98,14 @@ class Build:
             advice=partial(self.advice, modeler.prior),
         )
         if self.resume and RunFolder(self.out).finished(meta):
-            RunFolder(self.out).pairs.drop()  # left over from a kill at the very end
             say("the run is already complete; give --overwrite to build it again")
             return _summarise(RunFolder(self.out).report(), self, modeler.prior)
         if self.resume and (changes := RunFolder(self.out).changed_frames(meta)):
-            say(f"{', '.join(changes)} since the run: frames are registered with them, from what is kept of it")
+            say(f"{', '.join(changes)} since the run: what the others gave is kept")
         compile_kernels(say)
-        scene, _ = in_parallel(partial(compose.scene, modeler, whole), load)
+        learned_from = scene_frames(whole.indices, RunFolder(self.out).scene_frames() if self.resume else ())
+        meta = replace(meta, scene_frames=learned_from)
+        scene, _ = in_parallel(partial(compose.scene, modeler, whole, learned_from), load)
         if scene.camera_moves:
             say(
                 "the camera seems to move: what stands at the middle of each image is taken for the object; give "

@@ -37,7 +37,7 @@ def main() -> int:
 
 
 def begin(words: str) -> tuple[Job, dict[str, Any]]:
-    """Return a job and its initial note, which is written; results of other builds are deleted.
+    """Return a job and its initial note, which is written; results of builds with other options are deleted.
 
     Args:
         words: the job in JSON.
@@ -48,11 +48,14 @@ def begin(words: str) -> tuple[Job, dict[str, Any]]:
     job = Job(**{**values, "arguments": tuple(values["arguments"])})
     before = read_note(job.note)
     now = standing(job, before)
-    if now == "changed":
+    if now in ("changed", "other"):
         from modeler.export import RunFolder, locked
 
+        resumes = (
+            now == "changed" and RunFolder(job.run).is_sound
+        )  # frames that have not changed need not be registered
         with locked(job.run):
-            RunFolder.open(job.run, overwrite=True)
+            RunFolder.open(job.run, overwrite=not resumes, resume=resumes)
     note = {
         "sequence": job.sequence,
         "arguments": list(job.arguments),

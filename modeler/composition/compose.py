@@ -105,9 +105,15 @@ def segmenter(options: ObjectOptions) -> Segmenter:
     return Segmenter(roi=options.roi, max_depth_m=options.max_depth_m)
 
 
-def scene(modeler: Modeler, sequence: AbstractSequence) -> Scene:
-    """Return the scene that the segmenter learns from frames spread over the sequence."""
-    return modeler.segmenter.scene([sequence.frame(index) for index in scene_frames(sequence.indices)])
+def scene(modeler: Modeler, sequence: AbstractSequence, frames: Sequence[int] = ()) -> Scene:
+    """Return the scene that the segmenter learns.
+
+    Args:
+        modeler: has the segmenter.
+        sequence: of the scene.
+        frames: numbers of those to learn it from; none: frames spread over the sequence.
+    """
+    return modeler.segmenter.scene([sequence.frame(index) for index in frames or scene_frames(sequence.indices)])
 
 
 def registrar(

@@ -1,4 +1,4 @@
-"""Registrations of an unfinished run, each stored as soon as it is made."""
+"""Registrations of a run, each stored as soon as it is made."""
 
 from __future__ import annotations
 
@@ -40,31 +40,27 @@ _digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, 
 class Pairs:
     """A folder with one file per registration, so that a killed run need not repeat them.
 
-    A file is named by the two frames and a digest of all other inputs.
+    A file is named by the two frames and two digests: of the views and the method, and of the prior of the motion.
+    Registrations of a complete run lie in a second folder; where frames are added, they count as well for pairs whose
+    prior has changed by what the new frames tell.
     """
 
     folder: Path
     """It is made when there is something to keep."""
 
-    def get(self, source: int, target: int, key: str) -> Posterior | None:
-        """Return the stored result, to the bit; None if there is none.
+    def get(self, source: int, target: int, key: tuple[str, str]) -> Posterior | None:
+        """Return the stored result, to the bit, or that of a complete run under another prior; None if there is none.
 
         Args:
             source: frame number.
             target: frame number.
-            key: a digest of all inputs of the result.
+            key: digests of views and method, and of the prior.
         """
-        try:
-            data = read_regular(self._path(source, target, key))
-            packed = data[_CHECK_BYTES:]
-            if data[:_CHECK_BYTES] != _check(packed):  # damaged: reading it could fail in any way, or return anything
-                return None
-            with np.load(io.BytesIO(packed), allow_pickle=False) as kept:
-                return _posterior({name: kept[name] for name in kept.files})
-        except (InputError, ValueError, KeyError):  # of another version
-            return None
+        before = self._done.glob(self._name(source, target, (key[0], "*")))
+        places = [self._path(source, target, key), self._done / self._name(source, target, key), *sorted(before)]
+        return next((found for path in places if (found := _read(path)) is not None), None)
 
-    def keep(self, posterior: Posterior, key: str) -> None:
+    def keep(self, posterior: Posterior, key: tuple[str, str]) -> None:
         """Store the result. If this fails, as on a full disk, it will be computed again."""
         packed = io.BytesIO()
         np.savez(packed, allow_pickle=False, **_arrays(posterior))
@@ -77,8 +73,8 @@ class Pairs:
 
     @property
     def marked(self) -> bool:
-        """Whether the folder exists, or remains of it after a kill: the sign of an unfinished run."""
-        return any(folder.is_dir() and not folder.is_symlink() for folder in (self.folder, self._dropped))
+        """Whether the folder exists: the sign of an unfinished run."""
+        return self.folder.is_dir() and not self.folder.is_symlink()
 
     def mark(self) -> None:
         """Make the folder.
@@ -86,37 +82,43 @@ class Pairs:
         Raises:
             OSError: if that cannot be.
         """
+        for folder in (self.folder, self._done):
+            if folder.is_symlink():
+                folder.unlink()
         self.folder.mkdir(exist_ok=True)
 
     def empty(self) -> None:
-        """Forget everything, or, where the program is killed at it, nothing; the folder stays.
+        """Forget everything; the folder stays.
 
         Raises:
             OSError: if that cannot be.
         """
-        shutil.rmtree(self._dropped, ignore_errors=True)
-        if self.folder.is_dir() and not self.folder.is_symlink():
-            self.folder.rename(self._dropped)
-        self.mark()
-        shutil.rmtree(self._dropped, ignore_errors=True)
+        shutil.rmtree(self._done, ignore_errors=True)
+        for file in self.folder.iterdir():
+            file.unlink()
 
-    def drop(self) -> None:
-        """Forget everything, or, where the program is killed at it, nothing; the folder goes.
+    def complete(self) -> None:
+        """Move everything to what is of complete runs; the folder goes.
 
         Raises:
             OSError: if that cannot be.
         """
-        shutil.rmtree(self._dropped, ignore_errors=True)
-        if self.folder.is_dir() and not self.folder.is_symlink():
-            self.folder.rename(self._dropped)
-            shutil.rmtree(self._dropped)
+        if self.marked:
+            for file in self.folder.iterdir():
+                self._done.mkdir(exist_ok=True)
+                file.rename(self._done / file.name)
+            self.folder.rmdir()
 
     @property
-    def _dropped(self) -> Path:
-        return self.folder.with_name(f"{self.folder.name}.dropped")
+    def _done(self) -> Path:
+        return self.folder.with_name(f"{self.folder.name}.done")
 
-    def _path(self, source: int, target: int, key: str) -> Path:
-        return self.folder / f"{source:06d}-{target:06d}-{key}.pair"
+    def _path(self, source: int, target: int, key: tuple[str, str]) -> Path:
+        return self.folder / self._name(source, target, key)
+
+    @staticmethod
+    def _name(source: int, target: int, key: tuple[str, str]) -> str:
+        return f"{source:06d}-{target:06d}-{key[0]}-{key[1]}.pair"
 
 
 @final
@@ -131,9 +133,8 @@ class PairCache(AbstractPairCache):
 
     def posterior_of(self, registrar: AbstractRegistrar, pair: ViewPair) -> Posterior:
         """Return the stored result of the same registration, or else register and store it."""
-        state, evidence = pair.rng.bit_generator.state, pair.density.evidence
-        inputs = (registrar, sorted(self.versions.items()), state, evidence, pair.effort)
-        key = _key(inputs, (pair.source, pair.target), pair.density)
+        inputs = (registrar, sorted(self.versions.items()), pair.rng.bit_generator.state, pair.effort)
+        key = _of_views(inputs, (pair.source, pair.target)), _of_prior(pair.density)
         stored = self.pairs.get(pair.source.index, pair.target.index, key)
         if stored is not None:
             return stored
@@ -142,21 +143,40 @@ class PairCache(AbstractPairCache):
         return found
 
 
+def _read(path: Path) -> Posterior | None:
+    """Return the registration in a file; None if there is none."""
+    try:
+        data = read_regular(path)
+        packed = data[_CHECK_BYTES:]
+        if data[:_CHECK_BYTES] != _check(packed):  # damaged: reading it could fail in any way, or return anything
+            return None
+        with np.load(io.BytesIO(packed), allow_pickle=False) as kept:
+            return _posterior({name: kept[name] for name in kept.files})
+    except (InputError, ValueError, KeyError):  # of another version
+        return None
+
+
 def _check(packed: bytes) -> bytes:
     """Return what stands before the arrays in a file, to tell whether they are as they were written."""
     return hashlib.blake2b(packed, digest_size=_CHECK_BYTES).digest()
 
 
-def _key(inputs: Sequence[object], views: Sequence[RayImage], density: AbstractPoseDensity) -> str:
-    """Return a digest of all inputs of a registration.
-
-    A pair may be registered more than once: with wider limits, or with what was learned from frames in between.
-    """
+def _of_views(inputs: Sequence[object], views: Sequence[RayImage]) -> str:
+    """Return a digest of all inputs of a registration but the prior."""
     digest = hashlib.blake2b(" ".join(map(str, inputs)).encode(), digest_size=12)
     for view in views:
         if view not in _digests:
             _digests[view] = _digest(view)
         digest.update(_digests[view])
+    return digest.hexdigest()
+
+
+def _of_prior(density: AbstractPoseDensity) -> str:
+    """Return a digest of a prior.
+
+    A pair may be registered more than once: with wider limits, or with what was learned from frames in between.
+    """
+    digest = hashlib.blake2b(str(density.evidence).encode(), digest_size=12)
     drawn = density.sample(_DRAWN, np.random.default_rng(0))
     for numbers in (drawn, density.log_density(drawn), density.log_prior(drawn)):
         digest.update(np.ascontiguousarray(numbers).tobytes())

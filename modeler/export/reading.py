@@ -272,6 +272,7 @@ _WHOLE: dict[str, Test] = {
     "reasons": lambda value: isinstance(value, list) and all(map(_is_text, value)),
     "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),
     "evidence": _null_or(lambda value: isinstance(value, dict) and all(map(_is_figure, value.values()))),
+    "scene_frames": _null_or(lambda value: isinstance(value, list) and all(map(_is_whole, value))),
     "seconds": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
     "up": _null_or(_is_direction),
     "support_offset_m": _null_or(_is_number),  # which reports of earlier versions have not, nor `up`

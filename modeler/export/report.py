@@ -73,6 +73,8 @@ class RunMeta:
     """Wall time in s by part of the program."""
     digests: Mapping[int, str] = field(default_factory=dict)
     """Of the images and the camera of each frame, by its number; empty where they are not known beforehand."""
+    scene_frames: Sequence[int] = ()
+    """Numbers of the frames that the scene was learned from."""
     versions: Mapping[str, str] = field(default_factory=_versions)
     """Version by package."""
     advice: Callable[[Mapping[str, Any]], Sequence[str]] = _no_advice
@@ -99,6 +101,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         "settings": dict(meta.settings),
         "versions": dict(meta.versions),
         "seconds": dict(meta.seconds),
+        "scene_frames": list(meta.scene_frames),
         "digests": {str(index): digest for index, digest in meta.digests.items()},
         "complete": step.last and "interrupted" not in verdict.codes,
         "closed": loops_closed(_taking_part(step)) > 0,

@@ -34,9 +34,8 @@ class RunFolder:
 
     If this takes long, as for a thousand frames, some steps are skipped to limit it to a tenth of the time. Each file
     is replaced atomically, the report last: a run killed at any moment leaves no partial file. After the last step all
-    files are on the disk; before, they are flushed in the background. Until the run has ended, each registration is
-    stored as well. `RunFolder(path)` is for reading; `RunFolder.open` makes one to write
-    to.
+    files are on the disk; before, they are flushed in the background. Each registration is stored as well.
+    `RunFolder(path)` is for reading; `RunFolder.open` makes one to write to.
     """
 
     path: Path
@@ -65,8 +64,6 @@ class RunFolder:
         folder.check(overwrite=overwrite, resume=resume)
         try:
             path.mkdir(parents=True, exist_ok=True)
-            if folder.pairs.folder.is_symlink():
-                folder.pairs.folder.unlink()
             folder.pairs.mark()  # from here on the folder is that of a run, also after a kill
             resumes = resume and (path / _REPORT).exists()
             leftovers = [part for name in _OURS for part in path.glob(f".{name}.*{PART}")]
@@ -124,8 +121,17 @@ class RunFolder:
         return True
 
     @property
+    def is_sound(self) -> bool:
+        """Whether a report is here that is as `modeler` writes it."""
+        try:
+            self.result()
+        except InputError:
+            return False
+        return True
+
+    @property
     def pairs(self) -> Pairs:
-        """The registrations of a run that has not ended."""
+        """The registrations of a run."""
         return Pairs(self.path / ".pairs")
 
     def stored(self, path: Path) -> str:
@@ -209,6 +215,14 @@ class RunFolder:
         }
         return tuple(f"{_listed(names)} {what}" for what, names in kinds.items() if names)
 
+    def scene_frames(self) -> tuple[int, ...]:
+        """Return the numbers of the frames that the scene was learned from; none where that is not known.
+
+        Raises:
+            InputError: if the report cannot be read.
+        """
+        return tuple(self.result().get("scene_frames") or ()) if (self.path / _REPORT).exists() else ()
+
     def changed_versions(self, meta: RunMeta) -> tuple[str, ...]:
         """Return the packages, each with its version, with which a run was begun that is to be resumed with others.
 
@@ -251,7 +265,7 @@ class RunFolder:
         return self.newest
 
     def finish(self) -> None:
-        """Bring the recording to the disk; forget the registrations, unless the run ended early and may be resumed.
+        """Bring the recording to the disk; take the mark of an unfinished run away unless it ended early.
 
         Raises:
             InputError: if that cannot be.
@@ -263,9 +277,9 @@ class RunFolder:
             raise InputError(f"{recording}: cannot be written ({error.strerror}); choose another place") from error
         if self.report()["complete"]:
             try:
-                self.pairs.drop()
+                self.pairs.complete()
             except OSError as error:
-                raise InputError(f"{self.pairs.folder}: cannot be removed ({error.strerror}); remove it") from error
+                raise InputError(f"{self.pairs.folder}: cannot be renamed ({error.strerror}); remove it") from error
 
 
 def _listed(numbers: Collection[str]) -> str:

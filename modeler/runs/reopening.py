@@ -16,7 +16,7 @@ from modeler.export import RunFolder, edges_of, poses_of
 from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
-from modeler.segmentation import Scene
+from modeler.segmentation import Scene, scene_frames
 from modeler.sequences import (
     AbstractSequence,
     CalibratedSequence,
@@ -111,7 +111,8 @@ class Part:
         roi = settings.get("roi")
         limits = ObjectOptions(roi=None if roi is None else tuple(roi), max_depth_m=settings.get("max_depth_m"))
         modeler = compose.modeler(self.sequence, PriorOptions(prior="general"), MethodOptions(), limits)
-        return modeler, compose.scene(modeler, self.sequence)
+        learned_from = scene_frames(self.sequence.indices, self.report.get("scene_frames") or ())
+        return modeler, compose.scene(modeler, self.sequence, learned_from)
 
     def check(self) -> None:
         """Look at the first and the last frame.

@@ -89,10 +89,18 @@ class Scene:
     """Noise statistics of the camera from planes around the object; None without enough planar surface."""
 
 
-def scene_frames(indices: Sequence[int], *, count: int = 15) -> tuple[int, ...]:
-    """Return the numbers of at most `count` frames, spread evenly over a sequence, from which to learn its scene."""
+def scene_frames(indices: Sequence[int], before: Sequence[int] = (), *, count: int = 15) -> tuple[int, ...]:
+    """Return the numbers of frames, spread evenly over a sequence, from which to learn its scene.
+
+    Args:
+        indices: numbers of all its frames.
+        before: those from which it was learned before more frames came: they are kept, so that views of earlier frames
+            stay the same, unless some are gone or they are less than half as many as there can be now.
+        count: how many at most.
+    """
     places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
-    return tuple(indices[place] for place in places.astype(np.int64).tolist())
+    kept = 2 * len(before) >= len(places) and {*before} <= {*indices}
+    return tuple(before) if kept else tuple(indices[place] for place in places.astype(np.int64).tolist())
 
 
 def learn(layers: Layers, allowed: BoolArray, noise: DepthNoise, *, least_points: float) -> Scene:

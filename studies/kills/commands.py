@@ -115,7 +115,7 @@ class CommandTrials:
         self._made.mkdir(exist_ok=True)
         log = self.inputs.with_name(f"{self.inputs.name}.log")
         log.unlink(missing_ok=True)
-        command = [sys.executable, "-m", "kills.child", str(log), str(change), *COMMANDS[self.name], *flags]
+        command = [sys.executable, "-m", "studies.kills.child", str(log), str(change), *COMMANDS[self.name], *flags]
         ended = subprocess.run(
             command,
             cwd=self.inputs,
