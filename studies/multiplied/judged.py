@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, final
+from typing import Final, TypeVar, final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,8 @@ from modeler.types import Array
 from studies.multiplied.study import AS_IT_IS, Run
 from studies.multiplied.ways import WAYS
 from studies.results.tables import markdown
+
+Key = TypeVar("Key")
 
 MAX_DEG: Final = 3.0
 """Rotation error of a pose from which on a model is called wrong, as in the study of trust."""
@@ -49,17 +51,31 @@ def judged(run: Run, whole: Run, data: Path) -> Judged:
     common = sorted(set(reference) & set(found), key=int)
     if len(common) < 2:
         return Judged(run, None, None)
-    points_m = {key: _points_m(run, key) for key in common}
-    said_m = [se3.transform(found[key], points_m[key]) for key in common]
-    true_m = [se3.transform(reference[key], points_m[key]) for key in common]
+    return Judged(run, *apart(found, reference, {key: _points_m(run, key) for key in common}))
+
+
+def apart(
+    found: Mapping[Key, Array], reference: Mapping[Key, Array], points_m: Mapping[Key, Array]
+) -> tuple[float, float]:
+    """Return the largest rotation error of a pose in degrees, and of a view's surface (rms) in m.
+
+    Rotations are aligned by their mean; surfaces by a similarity, so that an error of scale alone is none.
+
+    Args:
+        found: object_from_camera (4, 4).
+        reference: the same as it should be, in any frame of the object.
+        points_m: (n, 3) of the object in the camera frame, of the views to compare: two or more.
+    """
+    said_m = [se3.transform(found[key], points_m[key]) for key in points_m]
+    true_m = [se3.transform(reference[key], points_m[key]) for key in points_m]
     rotation, scale, offset_m = _similarity(np.concatenate(said_m), np.concatenate(true_m))
     apart_m = [
         float(np.sqrt(np.square(scale * said @ rotation.T + offset_m - true).sum(axis=1).mean()))
         for said, true in zip(said_m, true_m, strict=True)
     ]
-    rotations = Rotation.from_matrix([reference[key][:3, :3] @ found[key][:3, :3].T for key in common])
+    rotations = Rotation.from_matrix([reference[key][:3, :3] @ found[key][:3, :3].T for key in points_m])
     turned_deg = np.degrees((rotations.mean().inv() * rotations).magnitude())
-    return Judged(run, float(turned_deg.max()), max(apart_m))
+    return float(turned_deg.max()), max(apart_m)
 
 
 def text(all_judged: Sequence[Judged]) -> str:

@@ -1,0 +1,1 @@
+"""Whole builds of captures that another renderer makes, every factor drawn at random together."""

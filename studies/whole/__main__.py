@@ -1,0 +1,93 @@
+"""Build models of captures drawn with every factor at random: `python -m studies whole --things FILE`.
+
+Another renderer (rays cast by Open3D, depth cameras of their own) shows meshes and photographs that packages ship;
+`python -m studies whole.things` gathers these into the file. Meshes, photographs and draws are split into two halves:
+anything may be mended by the tuning half; the other is for a single evaluation at the end. Every run is written as it
+ends (HALF.jsonl), and an interrupted study continues. The table goes to stdout, progress to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Final
+
+import numba
+
+from studies.results.tables import FOLDER, record
+from studies.results_file import earlier_results
+from studies.whole.plan import HALVES, Half, Plan
+from studies.whole.study import Outcome, outcome
+from studies.whole.tables import counts, text
+
+CAPTURES: Final = 160
+"""Of a half."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies whole", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--things", type=Path, required=True, help="file of meshes and photographs")
+    parser.add_argument("--half", choices=HALVES, default="tuning", help="which meshes and draws")
+    parser.add_argument("--captures", type=int, default=CAPTURES, metavar="N", help="of the half")
+    parser.add_argument("--only", type=int, nargs="+", metavar="NUMBER", help="only these captures")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs side by side")
+    parser.add_argument("--out", type=Path, default=Path("runs/whole"), help="folder of the results")
+    parser.add_argument("--record", action="store_true", help="put the counts of the half into the results")
+    options = parser.parse_args(arguments)
+    if options.captures < 1 or options.jobs < 1:
+        parser.error("--captures and --jobs take whole numbers from 1 on")
+    if options.record and (options.captures != CAPTURES or options.only):
+        parser.error(f"the results are of all {CAPTURES} captures of a half")
+    options.out.mkdir(parents=True, exist_ok=True)
+    plans = [
+        Plan(options.half, number)
+        for number in range(options.captures)
+        if options.only is None or number in options.only
+    ]
+    path = options.out / f"{options.half}.jsonl"
+    done = {one.number: one for one in map(Outcome.of, map(json.loads, earlier_results(path)))}
+    missing = [plan for plan in plans if plan.number not in done]
+    began = time.perf_counter()
+    with path.open("a") as stream:
+        for number, one in enumerate(_outcomes(options.things, missing, options.jobs), 1):
+            done[one.number] = one
+            print(json.dumps(one.values()), file=stream, flush=True)
+            ended = f"{'right' if one.right else 'wrong'} with {one.status} {' '.join(one.codes)}"
+            print(
+                f"{number} of {len(missing)}: {one.number} {one.factors.thing}: {one.placed} of {one.factors.frames} "
+                f"frames, {ended}, {one.seconds:.0f} s; {time.perf_counter() - began:.0f} s",
+                file=sys.stderr,
+                flush=True,
+            )
+    outcomes = [done[plan.number] for plan in plans]
+    print(text(outcomes))
+    if options.record:
+        half: Half = options.half
+        record(FOLDER / "whole.json", [(f"{half} half, {name}", *row) for name, *row in counts(outcomes)])
+    return 0
+
+
+def _outcomes(things: Path, plans: Sequence[Plan], jobs: int) -> Iterator[Outcome]:
+    """Yield the outcomes of plans as they come; each run has one thread, to leave the cores to runs side by side."""
+    if jobs == 1:
+        numba.set_num_threads(1)
+        yield from (outcome(things, plan) for plan in plans)
+        return
+    context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
+    # A function of this module would not be found: workers do not import the `__main__` of a package.
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool:
+        for future in as_completed([pool.submit(outcome, things, plan) for plan in plans]):
+            yield future.result()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""One capture from its plan to figures: what was placed, whether it is right, and what the run says of itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from modeler import se3
+from modeler.types import InputError, Step
+from studies.multiplied.judged import MAX_DEG, apart
+from studies.trust.study import built
+from studies.whole.capture import Capture
+from studies.whole.plan import Factors, Half, Plan
+from studies.whole.things import Thing, read
+
+_POINTS: Final = 300
+"""Of a view that are compared: errors of the surface are then known to a few per cent."""
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """What a run came to."""
+
+    half: Half
+    """Of the study."""
+    number: int
+    """Within the half."""
+    factors: Factors
+    """What was drawn."""
+    placed: int
+    """Number of frames in the model."""
+    status: int
+    """With which `modeler build` ends: 0, 2 or 3."""
+    codes: tuple[str, ...]
+    """Of what speaks against the model."""
+    words: tuple[str, ...]
+    """The same for people."""
+    evidence: Mapping[str, tuple[float | None, float | None]]
+    """Value and limit by name."""
+    outcomes: Mapping[str, str]
+    """Of frames that were left out, by frame number."""
+    tolerance_m: float
+    """Of the verdict; 0 without one."""
+    error_deg: float | None
+    """Largest rotation error of a pose after alignment of all rotations; None with fewer than two poses."""
+    error_m: float | None
+    """Largest error of a view's surface (rms) after alignment by a similarity; None likewise."""
+    seconds: float
+    """Wall time of the run without rendering."""
+
+    @property
+    def right(self) -> bool:
+        """Whether the model is right to its tolerance."""
+        if self.error_deg is None or self.error_m is None:
+            return False
+        return self.error_deg <= MAX_DEG and self.error_m <= self.tolerance_m
+
+    def values(self) -> dict[str, Any]:
+        """Return the figures as JSON holds them."""
+        return {**asdict(self), "right": self.right}
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> Outcome:
+        """Return what JSON held."""
+        fields = {name: value for name, value in values.items() if name != "right"}
+        return Outcome(**{**fields, "factors": Factors(**values["factors"])})
+
+
+Look = Callable[[Capture, Step | None], None]
+
+
+def outcome(path: Path, plan: Plan, look: Look = lambda capture, step: None) -> Outcome:
+    """Build the model of a capture as `modeler build` does, without recording, and compare it with the truth.
+
+    Args:
+        path: of the meshes and photographs.
+        plan: of the capture.
+        look: receives the capture and the last step; None if the input was refused.
+    """
+    things, pictures = _read(path)
+    capture = Capture(plan.factors(things, len(pictures)), plan.seed, things, pictures)
+    capture.frame(0)  # renders all, so that the time is the run's
+    began = time.perf_counter()
+    step, report = None, {}
+    try:
+        step, report = built(capture, capture.options(), plan.seed)
+    except InputError as error:
+        report = {"trustworthy": False, "reason_codes": [f"refused: {error}"], "reasons": [str(error)], "evidence": {}}
+    seconds = time.perf_counter() - began
+    look(capture, step)
+    error_deg, error_m = (None, None) if step is None else _errors(capture, step)
+    return Outcome(
+        half=plan.half,
+        number=plan.number,
+        factors=capture.factors,
+        placed=0 if step is None else len(step.solution.trajectory),
+        status=2 if step is None else 0 if report["trustworthy"] else 3,
+        codes=tuple(report["reason_codes"]),
+        words=tuple(report["reasons"]),
+        evidence={name: (figure["value"], figure["limit"]) for name, figure in report["evidence"].items()},
+        outcomes={} if step is None else {str(one.id): one.outcome for one in step.frames_so_far if not one.accepted},
+        tolerance_m=0.0 if step is None or step.verdict is None else step.verdict.tolerance_m,
+        error_deg=error_deg,
+        error_m=error_m,
+        seconds=seconds,
+    )
+
+
+@cache
+def _read(path: Path) -> tuple[list[Thing], list[npt.NDArray[np.uint8]]]:
+    return read(path)
+
+
+def _errors(capture: Capture, step: Step) -> tuple[float | None, float | None]:
+    """Return the largest errors of a run's poses, in degrees and m; None with fewer than two."""
+    found = step.solution.trajectory
+    if len(found) < 2:
+        return None, None
+    rng = np.random.default_rng(0)
+    points_m = {
+        index: rng.choice(step.views[index].points_m, min(_POINTS, len(step.views[index].points_m)), replace=False)
+        for index in found
+    }
+    return apart(found, {index: se3.inverse(pose) for index, pose in capture.truth().items()}, points_m)
