@@ -25,6 +25,7 @@ from modeler.sequences.rendering.recipe import Recipe, Table, Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
 from modeler.sequences.rendering.trajectory import Turntable
+from modeler.sequences.tum import trajectory
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, SensorNoise, Stated, Step
 from modeler.views import Sensor
 from modeler.viz import entities
@@ -124,6 +125,9 @@ def test_frames_of_both_runs_find_their_places(runs: tuple[Path, Path, Path, dic
     assert {path.name for path in runs[2].iterdir()} == {
         "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd", "report.json"
     }  # fmt: skip
+    times_s = [frame["timestamp"] for frame in report["frames"]]
+    assert (np.diff(times_s) > 0.0).all()
+    assert len(trajectory(runs[2] / "trajectory.txt")) == 2 * COUNT
     joining = [edge for edge in report["edges"] if edge["source"] >= COUNT > edge["target"]]
     assert len(joining) == 4
     assert sum(edge["accepted"] for edge in joining) >= 2

@@ -125,6 +125,19 @@ def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
     assert not other_modes(joins, Solution(), {}, 0.005).holds
 
 
+@pytest.mark.parametrize("bend", [1.0, 1.02, 1.05])
+def test_a_right_alignment_does_not_pay_for_poses_that_err_within_segments(bend: float) -> None:
+    """Pairs that share surface pay for them; an alignment that shares less must not be the likelier for it."""
+    poses = tabletop.turntable(6)
+    sensor = Sensor(SensorNoise(1e-3, 1e-3))
+    views = {k: sensor.ray_image(view.frame) for k, view in tabletop.views(tabletop.BRICK, poses).items()}
+    moved = {k + 6: shifted(view, k + 6) for k, view in views.items()}
+    true = tabletop.trajectory(poses)
+    bent = {k: true[0] @ se3.exp(bend * se3.log(se3.inverse(true[0]) @ pose)) for k, pose in true.items()}
+    parts = Segment(views, Solution(bent), ()), Segment(moved, Solution({k + 6: bent[k] for k in bent}), ())
+    assert Joiner().likelihoods(*parts, np.eye(4)[None])[0] > 0.0
+
+
 @pytest.mark.parametrize(("sigma_deg", "accepted"), [(1.0, True), (5.0, False)])
 def test_a_rotation_that_the_alignment_alone_bounds_joins_nothing(sigma_deg: float, accepted: bool) -> None:
     """A mug whose handle is hidden: the pair would repeat whatever the alignment of the models said."""

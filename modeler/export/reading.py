@@ -314,6 +314,7 @@ _EDGE: dict[str, Test] = {
 _SETTINGS: dict[str, Test] = {
     "joined": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_is_text, value)),
     "offset": _is_whole,
+    "later_s": _is_number,
     "sensor": _is_text,
     "roi": _null_or(lambda value: isinstance(value, list) and len(value) == 4 and all(map(_is_whole, value))),
     "max_depth_m": _null_or(_is_number),

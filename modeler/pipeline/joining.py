@@ -124,21 +124,25 @@ class Joiner:
         The tolerance is the chance deviation of the misfits of independent measurements, as many as a pair has for each
         view of the smaller segment (method, eq. 11.2).
         """
-        own = [self._own_log_likelihood(segment) for segment in (target, source) if len(segment.frames) > 1]
         count = min(_MAX_VIEWS, len(target.frames), len(source.frames))
         freedom = count * self._independent(target, source)
         allowed = 0.5 * (float(chdtri(freedom, _TAIL)) - freedom) / count
-        return alignment.log_likelihood >= float(np.mean(own or [0.0])) - allowed
+        return alignment.log_likelihood >= self._own(target, source)[0] - allowed
 
     def likelihoods(self, target: Segment, source: Segment, poses: Array) -> Array:
-        """Return the log-likelihoods (n,) in nats of alignments (n, 4, 4), means over pairs of views (eq. 11.1)."""
+        """Return the log-likelihoods (n,) in nats of alignments (n, 4, 4), means over pairs of views (eq. 11.1).
+
+        Poses within a segment err, too, so that right pairs of views pay, the more the more surface they share. Pairs
+        that share none pay nothing: without that price an alignment would gain by sharing less.
+        """
         targets, sources = self._spread(target, _MAX_VIEWS), self._spread(source, _MAX_VIEWS)
-        log_likelihoods = [
+        found = [
             self._nats(other, view, se3.inverse(target.solution.trajectory[t]) @ poses @ source.solution.trajectory[s])
             for t, view in targets.items()
             for s, other in sources.items()
         ]
-        return np.mean(log_likelihoods, axis=0)
+        log_likelihood, shared = np.mean(found, axis=0)
+        return log_likelihood - self._own(target, source)[1] * shared
 
     def weighted(self, target: Segment, source: Segment, alignments: Sequence[Alignment]) -> list[Alignment]:
         """Return alignments with their likelihoods and probabilities, likeliest first.
@@ -236,25 +240,27 @@ class Joiner:
         return Edge(posterior, "join", True, JoinsSegments(1.0, 0.0))
 
     def _nats(self, source: RayImage, target: RayImage, poses: Array) -> Array:
-        """Return the log-likelihoods (n,) of poses (n, 4, 4) of a pair of views.
+        """Return log-likelihoods of poses (n, 4, 4) of a pair of views, and the shares (0..1) of surface seen in both.
 
-        Without the cost of no overlap, because views from opposite sides have none.
+        (2, n). Without the cost of no overlap, because views from opposite sides have none.
         """
         pair = self._pair(source, target)
         found = pair.scores(poses, self._search.fine_m(pair), stride=1)
-        return pair.temper * found.surface + found.colours
+        return np.stack([pair.temper * found.surface + found.colours, found.explained])
 
-    def _own_log_likelihood(self, segment: Segment) -> float:
-        """Return the mean log-likelihood over all pairs of views of one segment."""
-        views, poses = self._spread(segment, _MAX_VIEWS), segment.solution.trajectory
-        return float(
-            np.mean(
-                [
-                    self._nats(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[0]
-                    for t, s in itertools.combinations(views, 2)
-                ]
-            )
-        )
+    def _own(self, *segments: Segment) -> tuple[float, float]:
+        """Return the mean log-likelihood of pairs of views within segments beyond what they pay for sharing surface.
+
+        And that price, in nats for all of the surface; at most 0.
+        """
+        own = [
+            self._nats(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[:, 0]
+            for views, poses in ((self._spread(one, _MAX_VIEWS), one.solution.trajectory) for one in segments)
+            for t, s in itertools.combinations(views, 2)
+        ]
+        log_likelihood, shared = np.mean(own, axis=0) if own else (0.0, 0.0)
+        price = min(float(log_likelihood / shared), 0.0) if shared > 0.0 else 0.0
+        return float(log_likelihood) - price * float(shared), price
 
     def _independent(self, target: Segment, source: Segment) -> float:
         """Return the median number of independent measurements of a pair of views, one of each segment."""

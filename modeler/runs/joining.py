@@ -52,7 +52,8 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
     began_s = time.perf_counter()
     first, second = reopened(run_a), reopened(run_b)
     offset = max(record["id"] for record in first.report["frames"]) + 1
-    second = _shifted(second, offset)
+    later_s = _later_s(first, second)
+    second = _shifted(second, offset, later_s)
     joiner = Joiner(Registrations(VisibilityRegistrar(), seed), pairs=pairs)
     parts = [Segment(run.views, run.solution, run.edges) for run in (first, second)]
     alignments = joiner.join(*parts)
@@ -78,7 +79,12 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
         sequence=" + ".join(sequences),
         seed=seed,
         prior="none",
-        settings={"joined": [made.stored(run) for run in (run_a, run_b)], "offset": offset, "pairs": pairs},
+        settings={
+            "joined": [made.stored(run) for run in (run_a, run_b)],
+            "offset": offset,
+            "later_s": later_s,
+            "pairs": pairs,
+        },
         camera=_least_known([*first.parts, *second.parts]),
     )
     with locked(out):
@@ -99,8 +105,18 @@ def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
     return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
 
 
-def _shifted(run: Reopened, offset: int) -> Reopened:
-    """Return a run with frame numbers from `offset` on."""
+def _later_s(first: Reopened, second: Reopened) -> float:
+    """Return by how much a run must be later than it was for its times to follow another's: 0 where none is shared."""
+    times_s = [sorted(frame["timestamp"] for frame in run.report["frames"]) for run in (first, second)]
+    (begin_s, *_, end_s), (start_s, *_, stop_s) = ([times[0], times[-1]] for times in times_s)
+    if stop_s < begin_s or end_s < start_s:
+        return 0.0
+    step_s = float(np.median(np.diff(times_s[0]))) if len(times_s[0]) > 1 else 1.0
+    return end_s + step_s - start_s
+
+
+def _shifted(run: Reopened, offset: int, later_s: float) -> Reopened:
+    """Return a run with frame numbers from `offset` on, and later."""
     edges = tuple(
         replace(
             edge,
@@ -120,8 +136,9 @@ def _shifted(run: Reopened, offset: int) -> Reopened:
         odometry=odometry,
         relative_covariance=lambda target, source: before(target - offset, source - offset),
     )
-    views = {frame + offset: renumbered(view, offset) for frame, view in run.views.items()}
-    report = dict(run.report) | {"frames": [r | {"id": r["id"] + offset} for r in run.report["frames"]]}
+    views = {frame + offset: renumbered(view, offset, later_s) for frame, view in run.views.items()}
+    frames = [r | {"id": r["id"] + offset, "timestamp": r["timestamp"] + later_s} for r in run.report["frames"]]
+    report = dict(run.report) | {"frames": frames}
     return replace(run, report=report, views=views, edges=edges, solution=solution)
 
 

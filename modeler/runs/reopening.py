@@ -46,6 +46,8 @@ class Part:
     """The sequence."""
     offset: int = 0
     """Offset of its frame numbers in the joined run."""
+    later_s: float = 0.0
+    """By how much its frames are later in the joined run."""
 
     @property
     def accepted(self) -> tuple[int, ...]:
@@ -95,7 +97,7 @@ class Part:
                 )
             if log_factor:
                 view = self.sensor.refocused(view, log_factor)
-            views[frame + self.offset] = renumbered(view, self.offset)
+            views[frame + self.offset] = renumbered(view, self.offset, self.later_s)
         return views
 
     @property
@@ -151,7 +153,8 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
     settings = report["settings"]
     if "joined" in settings:
         first, second = (_parts(folder.located(part), places, (*within, run.resolve())) for part in settings["joined"])
-        moved = (replace(part, offset=part.offset + int(settings["offset"])) for part in second)
+        offset, later_s = int(settings["offset"]), float(settings.get("later_s", 0.0))
+        moved = (replace(part, offset=part.offset + offset, later_s=part.later_s + later_s) for part in second)
         return (*first, *moved)
     if places is not None and not places:
         raise InputError(f"`sequence` is given too few times; give that of {run}, too, in order")
@@ -197,9 +200,10 @@ def estimated_camera(file: Path | None) -> dict[str, float | str] | None:
     return None if file is None else read_focal_factor(file).values()
 
 
-def renumbered(view: RayImage, offset: int) -> RayImage:
-    """Return a view with another frame number."""
-    return replace(view, frame=replace(view.frame, index=view.frame.index + offset))
+def renumbered(view: RayImage, offset: int, later_s: float = 0.0) -> RayImage:
+    """Return a view with another frame number and time."""
+    frame = view.frame
+    return replace(view, frame=replace(frame, index=frame.index + offset, time_s=frame.time_s + later_s))
 
 
 @dataclass(frozen=True, eq=False)
