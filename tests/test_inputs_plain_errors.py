@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from modeler.cli import main
+from modeler.cli.info import of_the_scene
 from modeler.sequences import Overrides, Survey, bundled, open_sequence, survey, write_bop
 from modeler.sequences.ray_distance import AxialSequence, stretch
 from modeler.sequences.ros.messages import from_rvl
@@ -103,6 +104,37 @@ def test_distance_along_the_ray_is_reported_and_mended(tmp_path: Path, capfd: py
     assert isinstance(mended, AxialSequence)
     assert not survey(mended).doubts
     assert not survey(whole.select(frames=slice(0, 3))).plain_errors
+
+
+def doubts_of(folder: Path, *, noise: float = 0.0, from_column: int = 0) -> list[str]:
+    """Return the doubts of `info` about the bundled box, with more noise, or seen from some column of the images on."""
+    rng, frames = np.random.default_rng(0), []
+    for frame in open_sequence(bundled("box")):
+        depth_m = frame.depth_m[:, from_column:]
+        depth_m = depth_m * (1.0 + noise * rng.standard_normal(depth_m.shape).astype(np.float32))
+        height, width = depth_m.shape
+        camera = replace(frame.camera, width=width, height=height, cx=frame.camera.cx - from_column)
+        frames.append(Frame(frame.index, frame.time_s, depth_m, camera, None, None))
+    write_bop(folder, frames)
+    sequence = open_sequence(folder)
+    return [*survey(sequence).doubts, *of_the_scene(sequence)]
+
+
+def test_doubts_are_what_is_wrong_with_a_capture(tmp_path: Path) -> None:
+    assert doubts_of(tmp_path / "right") == []
+    assert doubts_of(tmp_path / "noisy", noise=0.02)[0].startswith("depth scatters by 2.0% of the distance")
+    whole = open_sequence(bundled("box")).frame(0)
+    assert whole.mask is not None
+    middle = int(np.median(np.nonzero(whole.mask)[1]))
+    assert "the image cuts off the object" in doubts_of(tmp_path / "cut", from_column=middle)[-1]
+
+
+def test_the_gravest_doubt_comes_first(tmp_path: Path) -> None:
+    found = replace(cards(tmp_path / "s", mirrored=True), range_m=(0.01, 0.02, 0.03), repeated=(1,), noise=0.1)
+    words = ("is the unit right?", "colour is mirrored", "depth scatters", "have the depth of the frame before")
+    assert len(found.doubts) == len(words)
+    for doubt, some in zip(found.doubts, words, strict=True):
+        assert some in doubt
 
 
 def packed(image: np.ndarray) -> bytes:

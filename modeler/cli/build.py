@@ -106,11 +106,8 @@ class Build:
         learned_from = scene_frames(whole.indices, RunFolder(self.out).scene_frames() if self.resume else ())
         meta = replace(meta, scene_frames=learned_from)
         scene, _ = in_parallel(partial(compose.scene, modeler, whole, learned_from), load)
-        if scene.camera_moves:
-            say(
-                "the camera seems to move: what stands at the middle of each image is taken for the object; give "
-                "masks, --roi or --max-depth-m where that is something else"
-            )
+        for doubt in scene.doubts:
+            say(doubt)
         with locked(self.out):
             before = RunFolder(self.out).changed_versions(meta) if self.resume else ()
             folder = RunFolder.open(self.out, overwrite=self.overwrite, resume=self.resume)

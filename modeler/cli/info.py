@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -50,17 +51,39 @@ class Info:
         sequence = open_sequence(self.input, self.given.overrides())
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
+        doubts = [*found.doubts, *of_the_scene(sequence)]
         if self.picture is not None:
             middle = sequence.indices[len(sequence.indices) // 2]
             write_picture(self.picture, [sequence.frame(index) for index in (sequence.indices[0], middle)])
         if self.json:
-            print(as_options(dumps(record(sequence, found), allow_nan=False)))
+            print(as_options(dumps(record(sequence, found, doubts), allow_nan=False)))
         else:
-            print(as_options("\n".join(f"{what:14}{said}" for what, said in rows(sequence, found))))
+            print(as_options("\n".join(f"{what:14}{said}" for what, said in rows(sequence, found, doubts))))
         return 0
 
 
-def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
+def of_the_scene(sequence: AbstractSequence) -> list[str]:
+    """Return what may be wrong with how the object was captured, in words."""
+    from modeler.composition import compose
+    from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
+    from modeler.segmentation import scene_frames
+    from modeler.types import Outcome
+
+    modeler = compose.modeler(sequence, PriorOptions(prior="general"), MethodOptions(), ObjectOptions())
+    scene, frames = compose.scene(modeler, sequence), scene_frames(sequence.indices)
+    outcomes = {index: modeler.segmenter.segment(sequence.frame(index), scene).outcome for index in frames}
+    doubts = list(scene.doubts)
+    for outcome, what in (
+        (Outcome.CUT_OFF, "the image cuts off the object: keep it in view, with a margin"),
+        (Outcome.TOO_FEW_POINTS, "no object is found: give masks, `roi` or `max_depth_m`"),
+    ):
+        some = [str(index) for index, each in outcomes.items() if each is outcome]
+        if some:
+            doubts.append(f"in {len(some)} of {len(frames)} frames looked at ({', '.join(some)}) {what}")
+    return doubts
+
+
+def record(sequence: AbstractSequence, found: Survey, doubts: Sequence[str]) -> dict[str, object]:
     """Return the results as JSON values."""
     camera, sensor, motion = found.cameras[0], sequence.sensor(), sequence.motion
     return {
@@ -80,11 +103,11 @@ def record(sequence: AbstractSequence, found: Survey) -> dict[str, object]:
         "sensor": None if sensor is None else sensor._asdict(),
         "motion": None if motion is None else dict(motion),
         "missing": list(found.missing),
-        "notes": [*found.doubts, *sequence.notes],
+        "notes": [*doubts, *sequence.notes],
     }
 
 
-def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
+def rows(sequence: AbstractSequence, found: Survey, doubts: Sequence[str]) -> list[tuple[str, str]]:
     """Return the results as (name, words)."""
     from modeler.sequences.base import span
 
@@ -113,10 +136,10 @@ def rows(sequence: AbstractSequence, found: Survey) -> list[tuple[str, str]]:
         lines.append(("sensor noise", f"{sensor[0]:.3g} across (w, h), {sensor[1] * 1000.0:.3g} mm along the ray"))
     if motion is not None:
         lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
-    lines += [("doubt", what) for what in found.doubts]
+    lines += [("doubt", what) for what in doubts]
     lines += [("missing", what) for what in found.missing]
     lines += [("note", note) for note in sequence.notes]
-    if found.doubts or sequence.notes:
+    if doubts or sequence.notes:
         override = "--intrinsics, --depth-scale-mm, --along-ray and --despite-doubts, here as for build and convert"
         lines.append(("to override", override))
     return lines

@@ -88,6 +88,16 @@ class Scene:
     range_noise: RangeNoise | None = None
     """Noise statistics of the camera from planes around the object; None without enough planar surface."""
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What may be wrong with the capture, in words."""
+        if not self.camera_moves:
+            return ()
+        return (
+            "the camera seems to move: what stands at the middle of each image is taken for the object; give masks, "
+            "`roi` or `max_depth_m` where that is something else",
+        )
+
 
 def scene_frames(indices: Sequence[int], before: Sequence[int] = (), *, count: int = 15) -> tuple[int, ...]:
     """Return the numbers of frames, spread evenly over a sequence, from which to learn its scene.
