@@ -8,6 +8,7 @@ from modeler.sequences.base import KeptSequence as KeptSequence
 from modeler.sequences.base import frame_range as frame_range
 from modeler.sequences.bop import BopSequence as BopSequence
 from modeler.sequences.bop import finest_unit_mm as finest_unit_mm
+from modeler.sequences.bop import scene_meta as scene_meta
 from modeler.sequences.bop import true_mesh as true_mesh
 from modeler.sequences.bop import write_bop as write_bop
 from modeler.sequences.calibrated import CalibratedSequence as CalibratedSequence

@@ -298,6 +298,17 @@ def finest_unit_mm(farthest_m: float) -> float:
     return next((unit for unit in _UNITS_MM if farthest_m * 1000.0 < 65535.0 * unit), _UNITS_MM[-1])
 
 
+def scene_meta(sequence: AbstractSequence) -> dict[str, object]:
+    """Return the entries of `sequence.json` that a sequence knows of itself."""
+    meta: dict[str, object] = {"name": sequence.name}
+    noise, motion = sequence.sensor(), sequence.motion
+    if noise is not None:
+        meta["sensor"] = noise._asdict()
+    if motion is not None:
+        meta["motion"] = dict(motion)
+    return meta
+
+
 def write_bop(
     folder: Path,
     frames: Iterable[Frame],

@@ -11,7 +11,7 @@ from source_trees import ROOT
 
 DOCS: Final = ROOT / "docs"
 GUIDE: Final = (
-    "capture build result export next track many python cameras priors pairs render troubleshooting files"
+    "capture build studio result export next track many python cameras priors pairs render troubleshooting files"
 ).split()
 PAGES: Final = {"README": ROOT / "README.md"} | {name: DOCS / f"{name}.md" for name in ("index", *GUIDE)}
 """File by name of each page whose commands are tried."""

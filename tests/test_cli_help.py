@@ -18,7 +18,7 @@ from modeler.composition.options import PriorOptions
 
 COMMANDS = (
     "build batch gallery register evaluate render view report export join info convert calibrate-sensor "
-    "calibrate-camera suggest track edit"
+    "calibrate-camera suggest track edit studio"
 ).split()
 DOCUMENTED = """out prior seed resume overwrite every frames roi max-depth-m max-rotation-deg max-offset-m max-shift-m
 step-deg step-sigma-deg held-sigma-deg held-sigma-m

@@ -30,6 +30,7 @@ from studies.formats.image_folders import small_frames, small_truth
 NOT_HERE = {
     r"--view\b|modeler view": "opens a window",
     r"--web\b": "serves until Ctrl-C",
+    r"modeler studio": "serves until Ctrl-C",
     r"realsense:": "needs a camera",
     r"dask:": "needs a cluster",
     r"--device cuda": "needs a GPU",

@@ -131,6 +131,11 @@ def view(run: Path, *, web: bool = False) -> Viewer:
     return start_web(recording) if web else start_window([recording])
 
 
+def is_loopback(host: str) -> bool:
+    """Return whether a request's header `Host`, a name and a port, is that of this machine."""
+    return host.rpartition(":")[0] in _LOOPBACK
+
+
 def reachable(sink: str) -> bool:
     """Return whether something listens where recordings are to be sent, `rerun+http://HOST:PORT/proxy`.
 
@@ -201,7 +206,7 @@ class _OneFile(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Send the file."""
         # Another name may be of a page elsewhere, which has it resolved to this machine to read what is here.
-        if self.headers.get("Host", "").rpartition(":")[0] not in _LOOPBACK:
+        if not is_loopback(self.headers.get("Host", "")):
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             return
         try:

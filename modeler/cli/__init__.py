@@ -40,6 +40,7 @@ from modeler.cli.join import Join
 from modeler.cli.pages import Gallery, Report, View
 from modeler.cli.register import Register
 from modeler.cli.render import Render
+from modeler.cli.studio import Studio
 from modeler.cli.suggest import Suggest
 from modeler.cli.track import Track
 from modeler.system.processes import check_room, share_one_heap
@@ -62,6 +63,7 @@ Command = (
     | Edit
     | Suggest
     | Gallery
+    | Studio
 )
 
 COMMANDS: dict[str, type[Command]] = {
@@ -82,6 +84,7 @@ COMMANDS: dict[str, type[Command]] = {
     "edit": Edit,
     "suggest": Suggest,
     "gallery": Gallery,
+    "studio": Studio,
 }
 _STYLE = (
     tyro.conf.OmitSubcommandPrefixes,

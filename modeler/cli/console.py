@@ -334,6 +334,8 @@ class Console:
         elif total > 1 and not self.watched and time.monotonic() - self._said_s > _PULSE_S:
             self._say(f"{stage}: {done} of {total}")
             self._bar.update(self._task, total=None, description=stage)  # forgets how fast the stage before went
+        elif total > 1:
+            self._say(f"{stage}: {done} of {total}", logging.DEBUG)
         self._bar.update(self._task, completed=done, total=total, description=stage)
 
     def _report_frame(self, frame: int, what: str) -> None:

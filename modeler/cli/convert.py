@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from modeler.cli.console import say
 from modeler.cli.options import FrameOptions, InputOptions
 from modeler.composition.options import default
-
-if TYPE_CHECKING:
-    from modeler.sequences import AbstractSequence
 
 LIVE_REACH_M = 16.0
 """Depth of a live camera beyond this is a measurement error."""
@@ -50,7 +47,7 @@ class Convert:
         from modeler.cli.reading import reading, while_it_lasts
         from modeler.runs.outputs import check_files, check_folder, run_inputs
         from modeler.runs.reopening import calibrated
-        from modeler.sequences import finest_unit_mm, frame_range, open_sequence, survey, write_bop
+        from modeler.sequences import finest_unit_mm, frame_range, open_sequence, scene_meta, survey, write_bop
         from modeler.system.regular_files import read_regular
         from modeler.types import InputError
 
@@ -79,7 +76,7 @@ class Convert:
                 self.out,
                 while_it_lasts(sequence) if sequence.live else watched(sequence, "writing"),
                 sequence.truth(),
-                _meta(sequence),
+                scene_meta(sequence),
                 depth_scale_mm=unit_mm,
                 files={
                     path.name: read_regular(path)
@@ -91,17 +88,6 @@ class Convert:
         for note in (*found.doubts, *sequence.notes):
             say(note)
         return 0
-
-
-def _meta(sequence: AbstractSequence) -> dict[str, object]:
-    """Return the entries of `sequence.json`."""
-    meta: dict[str, object] = {"name": sequence.name}
-    noise, motion = sequence.sensor(), sequence.motion
-    if noise is not None:
-        meta["sensor"] = noise._asdict()
-    if motion is not None:
-        meta["motion"] = dict(motion)
-    return meta
 
 
 def _poses(run: Path, out: Path) -> int:

@@ -67,7 +67,7 @@ def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Arr
     terms = "".join(f"<div><dt>{term}:</dt> <dd>{words}</dd></div>" for term, words in _TERMS.items())
     return [
         f"<h2>Pairs</h2><p class='quiet'>{note}</p><dl class='terms'>{terms}</dl>"
-        f"<div class='pairs'>{''.join(cards)}</div>"
+        f"<div class='pairs' id='pairs'>{''.join(cards)}</div>"
     ]
 
 
@@ -116,7 +116,7 @@ def outlined_cards(title: str, note: str, cards: Sequence[str]) -> Sequence[str]
     if not cards:
         return []
     return [
-        f"<h2>{title}</h2><p class='quiet'>{note}</p><div class='masks'>{''.join(cards)}</div>"
+        f"<h2>{title}</h2><p class='quiet'>{note}</p><div class='masks' id='{title.lower()}'>{''.join(cards)}</div>"
         f"<dialog id='large'></dialog><script>{_ENLARGE}</script>"
     ]
 

@@ -1,0 +1,84 @@
+"""Pictures of frames for the page."""
+
+from __future__ import annotations
+
+import io
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from modeler.types import BoolArray, Frame
+from modeler.viz.entities import OUTLINE_RGB
+from modeler.viz.images import outline
+
+THUMBNAIL_PX: Final = 80
+"""Height of a small picture."""
+_JPEG_QUALITY: Final = 85
+
+
+def picture(frame: Frame) -> npt.NDArray[np.uint8]:
+    """Return a frame as a picture (h, w, 3): its colour, else its depth, near bright."""
+    if frame.colour is not None:
+        return frame.colour
+    measured = frame.depth_m > 0.0  # False for NaN
+    if not measured.any():
+        return np.zeros((*frame.depth_m.shape, 3), dtype=np.uint8)
+    near, far = np.percentile(frame.depth_m[measured], (1, 99))
+    depth = np.where(measured, frame.depth_m, far)
+    grey = 235.0 - 190.0 * np.clip((depth - near) / max(far - near, 1e-6), 0.0, 1.0)
+    return np.repeat(np.where(measured, grey, 20.0).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def jpeg(frame: Frame) -> bytes:
+    """Return a frame as JPEG."""
+    return _encoded(Image.fromarray(np.ascontiguousarray(picture(frame))))
+
+
+def thumbnail(frame: Frame, mask: BoolArray | None) -> bytes:
+    """Return a small picture of a frame as JPEG, all but the mask (h, w) darkened."""
+    pixels = picture(frame)
+    if mask is not None:
+        pixels = np.where(mask[..., None], pixels, pixels // 3)
+    image = Image.fromarray(np.ascontiguousarray(pixels.astype(np.uint8)))
+    image.thumbnail((4 * THUMBNAIL_PX, THUMBNAIL_PX))
+    return _encoded(image)
+
+
+def outline_svg(mask: BoolArray | None) -> str:
+    """Return the outline of a mask (h, w) as SVG in px of the image; nothing without a mask."""
+    if mask is None:
+        return ""
+    steps = "".join(f"M{x0:g} {y0:g}L{x1:g} {y1:g}" for (x0, y0), (x1, y1) in outline(mask))
+    red, green, blue = OUTLINE_RGB
+    style = "fill='none' vector-effect='non-scaling-stroke'"
+    return (
+        f"<path d='{steps}' {style} stroke='black' stroke-width='4' opacity='0.5'/>"
+        f"<path d='{steps}' {style} stroke='rgb({red},{green},{blue})' stroke-width='2'/>"
+    )
+
+
+def stroke_svg(points: list[tuple[float, float]], radius_px: float, *, add: bool) -> str:
+    """Return a stroke of the brush as SVG."""
+    places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+    colour = "#35c26b" if add else "#e4572e"
+    return (
+        f"<polyline points='{places} {places.rpartition(' ')[2]}' fill='none' stroke='{colour}' opacity='0.55' "
+        f"stroke-width='{2.0 * radius_px:.1f}' stroke-linecap='round' stroke-linejoin='round'/>"
+    )
+
+
+def box_svg(corner: tuple[float, float], opposite: tuple[float, float]) -> str:
+    """Return a box as SVG."""
+    (x0, x1), (y0, y1) = (sorted((corner[axis], opposite[axis])) for axis in (0, 1))
+    return (
+        f"<rect x='{x0:.1f}' y='{y0:.1f}' width='{x1 - x0:.1f}' height='{y1 - y0:.1f}' fill='none' stroke='white' "
+        "stroke-width='2' stroke-dasharray='6 4' vector-effect='non-scaling-stroke'/>"
+    )
+
+
+def _encoded(image: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    return buffer.getvalue()

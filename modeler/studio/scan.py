@@ -1,0 +1,516 @@
+"""One scan: a capture, what of it is the object, and the runs made from it, kept in a folder of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import shlex
+import shutil
+import threading
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+from PIL import Image
+
+from modeler.composition import compose
+from modeler.composition.options import PriorOptions
+from modeler.export import FORMATS, RunFolder, write_atomically
+from modeler.segmentation import Segmenter, scene_frames
+from modeler.sequences import AbstractSequence, KeptSequence, finest_unit_mm, open_sequence, scene_meta, write_bop
+from modeler.studio.jobs import Job, Queue
+from modeler.system.regular_files import read_regular
+from modeler.types import BoolArray, InputError, Outcome, Segmentation
+
+STATE: Final = "scan.json"
+"""File of a scan's choices, by which its folder is known."""
+_BOXES: Final = (0.25, 0.4, 0.6, 0.85)  # sides of the boxes tried around a click, as shares of the image's
+_RUN: Final = re.compile(r"run-(\d+)")
+MESHES: Final = tuple(suffix.removeprefix(".") for suffix in FORMATS)
+"""Kinds of mesh files."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a person has chosen."""
+
+    sequence: str
+    """Path of the capture."""
+    roi: tuple[int, int, int, int] | None = None
+    """Region of the object in px, x0 y0 x1 y1."""
+    prior: str | None = None
+    """Name of the motion prior; None: as the sequence says, else auto."""
+    step_deg: float | None = None
+    """Turn from frame to frame (turntable)."""
+    step_sigma_deg: float | None = None
+    """Its standard deviation (turntable)."""
+    camera: str | None = None
+    """File of the estimated focal length."""
+    masked: str | None = None
+    """Name of the folder of frames with the masks as they are now; None: not written."""
+    dropped: tuple[int, ...] = ()
+    """Frames taken out of the latest run."""
+
+    @classmethod
+    def read(cls, path: Path) -> Choices:
+        """Read the choices of a scan.
+
+        Raises:
+            InputError: if the file is none of ours.
+        """
+        try:
+            found = json.loads(read_regular(path))
+            known = {one.name for one in fields(cls)}
+            given: dict[str, Any] = {name: found[name] for name in known & found.keys()}
+            if not isinstance(given["sequence"], str):
+                raise ValueError("its sequence is no path")
+            given |= {name: tuple(one) for name, one in given.items() if isinstance(one, list)}
+            return cls(**given)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise InputError(f"{path}: is no scan of modeler studio ({error}); remove it") from error
+
+
+@final
+class Scan:
+    """A capture being made into a model. Methods may be called from any thread."""
+
+    def __init__(self, folder: Path, choices: Choices, queue: Queue) -> None:
+        """Open a capture, and begin to look for the object in it.
+
+        Raises:
+            InputError: if it cannot be read.
+        """
+        self.folder, self.choices, self.queue = folder, choices, queue
+        self.sequence: AbstractSequence = KeptSequence(open_sequence(Path(choices.sequence)))
+        self.version = 0
+        """Grows with every change that pages show."""
+        self.found: dict[int, Segmentation] = {}
+        """The object by frame number, as far as it has been looked for."""
+        self.painted: dict[int, BoolArray] = self._read_painted()
+        """Masks (h, w) corrected by hand, by frame number."""
+        self.strokes: dict[int, int] = {}
+        """Number of corrections since the start, by frame number: pictures of before are out of date."""
+        self.fault = ""
+        """Why the object is not found, if frames cannot be read."""
+        self._asked = 0
+        self._worker = ThreadPoolExecutor(1, "segmentation")
+        self._lock = threading.RLock()
+        self.look()
+
+    @property
+    def name(self) -> str:
+        """Name of the scan, which is that of its folder."""
+        return self.folder.name
+
+    @property
+    def looking(self) -> bool:
+        """Whether the object has not been looked for in all frames yet."""
+        return len(self.found) < len(self.sequence.indices)
+
+    @property
+    def looked(self) -> int:
+        """How many times the object has been looked for anew."""
+        return self._asked
+
+    def mask(self, frame: int) -> BoolArray | None:
+        """Return the object (h, w) in a frame; None if it has not been looked for yet."""
+        if frame in self.painted:
+            return self.painted[frame]
+        return self.found[frame].mask if frame in self.found else None
+
+    def doubts(self) -> dict[int, str]:
+        """Return in words what is doubtful about the masks, by frame number."""
+        found = list(self.found.items())
+        return {
+            k: one.outcome.label for k, one in found if one.outcome is not Outcome.CONVERGED and k not in self.painted
+        }
+
+    # What the object is
+
+    def look(self) -> None:
+        """Look for the object in all frames, in the background."""
+        with self._lock:
+            self._asked += 1
+            self.found = {}
+            self._changed()
+            self._worker.submit(self._look, self._asked)
+
+    def box(self, corner: tuple[float, float], opposite: tuple[float, float]) -> None:
+        """Say that the object is within a box, given by two opposite corners (x, y) in px."""
+        camera = self.sequence.frame(self.sequence.indices[0]).camera
+        (x0, x1), (y0, y1) = (sorted((corner[axis], opposite[axis])) for axis in (0, 1))
+        roi = max(0, int(x0)), max(0, int(y0)), min(camera.width, int(x1) + 1), min(camera.height, int(y1) + 1)
+        if roi[2] - roi[0] < 2 or roi[3] - roi[1] < 2:
+            raise InputError("the box lies outside the image; draw it around the object")
+        self._choose(roi=roi)
+        self.look()
+
+    def point_at(self, frame: int, x: float, y: float) -> None:
+        """Say that the object is at a pixel: within the smallest box around it in which one is found that fits.
+
+        Raises:
+            InputError: if none is found there.
+        """
+        image = self.sequence.frame(frame)
+        column, row, camera = int(x), int(y), image.camera
+        if not (0 <= column < camera.width and 0 <= row < camera.height):
+            raise InputError("that is outside the image; click on the object")
+        mask = self.mask(frame)
+        if mask is not None and mask[row, column]:
+            return
+        for share in _BOXES:
+            half = 0.5 * share * camera.width, 0.5 * share * camera.height
+            left, top = (max(0, int(at - side)) for at, side in zip((x, y), half, strict=True))
+            right, bottom = min(camera.width, int(x + half[0])), min(camera.height, int(y + half[1]))
+            segmenter = Segmenter(roi=(left, top, right, bottom))
+            shown = replace(image, mask=None)
+            inside = segmenter.segment(shown, segmenter.scene([shown])).mask
+            rim = inside[top, left:right].any() or inside[bottom - 1, left:right].any()
+            rim = rim or inside[top:bottom, left].any() or inside[top:bottom, right - 1].any()
+            if inside[row, column] and not rim:
+                self.box((left, top), (right - 1, bottom - 1))
+                return
+        raise InputError("no object stands out there; draw a box around it, or paint it")
+
+    def whole_image(self) -> None:
+        """Forget the box."""
+        self._choose(roi=None)
+        self.look()
+
+    def paint(self, frame: int, points: Sequence[tuple[float, float]], radius_px: float, *, add: bool) -> None:
+        """Correct the mask of a frame with a stroke of a round brush.
+
+        Args:
+            frame: its number.
+            points: (x, y) in px along the stroke.
+            radius_px: of the brush.
+            add: whether the stroke is object; otherwise it is not.
+
+        Raises:
+            InputError: if the object has not been looked for in that frame yet.
+        """
+        mask = self.mask(frame)
+        if mask is None:
+            raise InputError("the object is still being looked for in this frame; wait a moment")
+        stroke = drawn(mask.shape, points, radius_px)
+        with self._lock:
+            self._keep_painted(frame, mask | stroke if add else mask & ~stroke)
+
+    def unpaint(self, frame: int) -> None:
+        """Take the found mask of a frame again."""
+        with self._lock:
+            if self.painted.pop(frame, None) is not None:
+                self._painted_file(frame).unlink(missing_ok=True)
+                self.strokes[frame] = self.strokes.get(frame, 0) + 1
+                self._choose(masked=None)
+
+    # Runs
+
+    def runs(self) -> list[Path]:
+        """Return the runs of `build`, from the first."""
+        found = ((match, path) for path in self.folder.glob("run-*") if (match := _RUN.fullmatch(path.name)))
+        return [path for _, path in sorted(found, key=lambda one: int(one[0][1]))]
+
+    @property
+    def run(self) -> Path | None:
+        """The latest run, without the frames taken out; None if there is none."""
+        runs = self.runs()
+        return None if not runs else self._edited(runs[-1]) if self.choices.dropped else runs[-1]
+
+    def report(self) -> Mapping[str, Any] | None:
+        """Return `report.json` of the latest run; None if there is none yet."""
+        if (run := self.run) is None:
+            return None
+        with contextlib.suppress(InputError):
+            return RunFolder(run).report()
+        return None
+
+    def build_jobs(self, *, resume: bool = False) -> list[Job]:
+        """Return the build that the choices ask for, and its page; painted masks are written where it reads them.
+
+        Args:
+            resume: whether it goes on with the latest run.
+
+        Raises:
+            InputError: if the masks cannot be written.
+        """
+        run = self.runs()[-1] if resume else self._next()
+        words = ["build", str(self._source()), "--out", str(run), *self.options(), *(["--resume"] if resume else [])]
+        if not resume:
+            self._choose(dropped=())
+        title, frames = "Building the model", len(self.sequence.indices)
+        return [Job(tuple(words), self.folder / f"{run.name}.log", title, frames=frames), self._page_job(run)]
+
+    def options(self) -> list[str]:
+        """Return the options of the build."""
+        chosen, words = self.choices, list[str]()
+        if chosen.prior is not None:
+            words += ["--prior", chosen.prior]
+        if chosen.prior == "turntable" and chosen.step_deg is not None:
+            words += ["--step-deg", f"{chosen.step_deg:g}"]
+            words += [] if chosen.step_sigma_deg is None else ["--step-sigma-deg", f"{chosen.step_sigma_deg:g}"]
+        if chosen.roi is not None and not self.painted:
+            words += ["--roi", *map(str, chosen.roi)]
+        return words + ([] if chosen.camera is None else ["--camera", chosen.camera])
+
+    def line(self) -> str:
+        """Return the command line of the next build."""
+        source = self.folder / (self.choices.masked or "masked-1") if self.painted else self.choices.sequence
+        return shlex.join(("modeler", "build", str(source), "--out", str(self._next()), *self.options()))
+
+    def edit_jobs(self, dropped: Sequence[int]) -> list[Job]:
+        """Return the re-optimisation of the latest run without frames; nothing where all are back: it is as it was.
+
+        Args:
+            dropped: numbers of the frames to leave out.
+        """
+        run = self.runs()[-1]
+        self._choose(dropped=tuple(sorted(dropped)))
+        if not dropped:
+            return []
+        out = self._edited(run)
+        words = ("edit", str(run), "--drop", ",".join(map(str, sorted(dropped))), "--out", str(out), "--overwrite")
+        return [Job(words, self.folder / f"{out.name}.log", "Optimising again"), self._page_job(out)]
+
+    def calibrate_job(self, known: str | None = None) -> Job:
+        """Return the estimation of the focal length from the latest run, for the next build.
+
+        Args:
+            known: what is accurate in the sequence, `focal-length` or `depth`; None: neither is known to be.
+        """
+        out = self.folder / f"camera-{len(self.runs())}.json"
+        words = ("calibrate-camera", str(self.runs()[-1]), "--out", str(out), "--overwrite")
+        words += () if known is None else ("--known", known)
+        self._choose(camera=str(out))
+        return Job(words, out.with_suffix(".log"), "Estimating the focal length")
+
+    def suggest_job(self) -> Job:
+        """Return the ranking of what to do next."""
+        run = self._some_run()
+        return Job(("suggest", str(run)), self.folder / "suggest.log", "Looking for the next turn")
+
+    def suggested(self) -> str:
+        """Return what was suggested to be done next, for the latest run, a line each; "" before."""
+        job = self.suggest_job()
+        messages = [
+            words for _, _, words in job.messages() if not words.startswith(("$ ", "in ", "ended ", "preparing"))
+        ]
+        ranked = job.out.read_text().splitlines()[:3] if job.out.exists() else []
+        return "\n".join([*ranked, *messages[-1:]])
+
+    def export_words(self) -> list[str]:
+        """Return what exports have said of their files."""
+        found = []
+        for log in sorted(self.folder.glob("export-*.log"), key=lambda path: path.stat().st_mtime, reverse=True):
+            words = [
+                words for _, _, words in Job((), log, "").messages() if not words.startswith(("$ ", "in ", "ended "))
+            ]
+            found += words[-1:]
+        return found
+
+    def export_job(self, what: str, *, texture: bool) -> Job:
+        """Return an export of the latest run.
+
+        Args:
+            what: suffix of a mesh file, or the program that a folder is for.
+            texture: whether an image is wrapped around the mesh; of files that can have one.
+        """
+        run, mesh = self._some_run(), what in MESHES
+        out = self.shelf / (f"{self.name}.{what}" if mesh else f"{self.name}-{what}")
+        if not mesh:
+            shutil.rmtree(out, ignore_errors=True)  # an export of ours, of which parts may be others now
+        words = ["export", str(run), "--out", str(out), "--overwrite"]
+        words += ["--texture"] if texture and what in ("glb", "obj") else [] if mesh else ["--for", what]
+        return Job(tuple(words), self.folder / f"export-{what}.log", f"Exporting {out.name}")
+
+    @property
+    def shelf(self) -> Path:
+        """Folder of the exports."""
+        return self.folder / "take-away"
+
+    def exports(self) -> list[Path]:
+        """Return what can be taken away, the newest first: files and folders."""
+        entries = [path for path in self.shelf.glob("*") if not path.name.startswith(".")]
+        return sorted(entries, key=lambda path: path.stat().st_mtime, reverse=True)
+
+    def choose_prior(self, prior: str | None, step_deg: float | None, step_sigma_deg: float | None) -> None:
+        """Choose how the object moved."""
+        self._choose(prior=prior, step_deg=step_deg, step_sigma_deg=step_sigma_deg)
+
+    @cached_property
+    def usual_prior(self) -> str:
+        """The prior where none is chosen."""
+        return compose.prior_name(PriorOptions(), self.sequence)
+
+    # Beneath
+
+    def _next(self) -> Path:
+        """Return the folder of the next run."""
+        numbers = [int(match[1]) for path in self.runs() if (match := _RUN.fullmatch(path.name))]
+        return self.folder / f"run-{max(numbers, default=0) + 1}"
+
+    def _page_job(self, run: Path) -> Job:
+        """Return the writing of the page about a run."""
+        words = ("report", str(run), "--overwrite")
+        return Job(words, self.folder / f"{run.name}-report.log", "Drawing the pictures")
+
+    def _some_run(self) -> Path:
+        run = self.run
+        if run is None:
+            raise InputError("there is no model yet; build one")
+        return run
+
+    @staticmethod
+    def _edited(run: Path) -> Path:
+        return run.with_name(f"{run.name}-edited")
+
+    def _source(self) -> Path:
+        """Return the folder that a build reads: the capture, or its frames with the masks as they are shown.
+
+        Raises:
+            InputError: if frames cannot be written, or masks are not there yet.
+        """
+        if not self.painted:
+            return Path(self.choices.sequence)
+        with self._lock:
+            if self.choices.masked is not None and (self.folder / self.choices.masked).is_dir():
+                return self.folder / self.choices.masked
+            if self.looking:
+                raise InputError("the object is still being looked for in some frames; wait a moment")
+            number = 1
+            while (out := self.folder / f"masked-{number}").exists():
+                number += 1
+            frames = [self.sequence.frame(k) for k in self.sequence.indices]
+            farthest_m = max(float(np.nanmax(frame.depth_m, initial=0.0)) for frame in frames)
+            robot = self.sequence.robot_path
+            write_bop(
+                out,
+                (replace(frame, mask=self.mask(frame.index)) for frame in frames),
+                meta=scene_meta(self.sequence),
+                depth_scale_mm=finest_unit_mm(farthest_m),
+                files={} if robot is None else {robot.name: read_regular(robot)},
+            )
+            self._choose(masked=out.name)
+            return out
+
+    def _look(self, asked: int) -> None:
+        """Find the object in each frame, as a build will, until something else is asked for."""
+        segmenter, sequence = Segmenter(roi=self.choices.roi), self.sequence
+        try:
+            scene = segmenter.scene([sequence.frame(k) for k in scene_frames(sequence.indices)])
+            for k in sequence.indices:
+                found = segmenter.segment(sequence.frame(k), scene)
+                with self._lock:
+                    if asked != self._asked:
+                        return
+                    self.found[k] = found
+                    self._changed()
+        except InputError as error:
+            self.fault = str(error)
+            self._changed()
+
+    def _keep_painted(self, frame: int, mask: BoolArray) -> None:
+        buffer = io.BytesIO()
+        Image.fromarray(mask.astype(np.uint8) * 255).save(buffer, "PNG")
+        write_atomically(self._painted_file(frame), buffer.getvalue())
+        self.painted[frame] = mask
+        self.strokes[frame] = self.strokes.get(frame, 0) + 1
+        self._choose(masked=None)
+
+    def _painted_file(self, frame: int) -> Path:
+        (self.folder / "painted").mkdir(parents=True, exist_ok=True)
+        return self.folder / "painted" / f"{frame:06d}.png"
+
+    def _read_painted(self) -> dict[int, BoolArray]:
+        found = {}
+        for path in sorted((self.folder / "painted").glob("*.png")):
+            with contextlib.suppress(OSError, ValueError, InputError):
+                found[int(path.stem)] = np.asarray(Image.open(io.BytesIO(read_regular(path)))) > 0
+        return found
+
+    def _choose(self, **changes: Any) -> None:
+        """Change choices, and keep them: a server that is killed goes on from there."""
+        with self._lock:
+            self.choices = replace(self.choices, **changes)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.folder / STATE, json.dumps(asdict(self.choices), indent=1) + "\n")
+            self._changed()
+
+    def _changed(self) -> None:
+        self.version += 1
+
+
+def drawn(shape: tuple[int, ...], points: Sequence[tuple[float, float]], radius_px: float) -> BoolArray:
+    """Return the pixels (h, w) that a round brush covers along points (x, y) in px."""
+    from PIL import ImageDraw
+
+    picture = Image.new("L", (shape[1], shape[0]))
+    draw, width = ImageDraw.Draw(picture), max(1, round(2.0 * radius_px))
+    if len(points) > 1:
+        draw.line([*points], fill=255, width=width)
+    for x, y in points:
+        draw.ellipse((x - radius_px, y - radius_px, x + radius_px, y + radius_px), fill=255)
+    return np.asarray(picture) > 0
+
+
+@final
+class Studio:
+    """All scans of a folder, and the commands that run: what every page shows."""
+
+    def __init__(self, out: Path, place: Path | None = None) -> None:
+        """Take the folder in which scans are kept, and the one in which captures are offered first.
+
+        Raises:
+            InputError: if the folder cannot be made.
+        """
+        self.out = out
+        self.place = place
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{out}: cannot be made ({error.strerror}); choose another `out`") from error
+        self.queue = Queue(out / "jobs.json")
+        self.current: Scan | None = None
+        """The scan that pages show."""
+        self.version = 0
+        """Grows where pages must be drawn anew."""
+        self._scans: dict[Path, Scan] = {}
+
+    def open(self, sequence: Path) -> Scan:
+        """Go on with the scan of a capture, or begin one.
+
+        Raises:
+            InputError: if it is no capture.
+        """
+        place = str(sequence.absolute())
+        kept = {folder: Choices.read(folder / STATE) for folder in self.folders()}
+        folder = next((folder for folder, one in kept.items() if one.sequence == place), None)
+        if folder is None:
+            stem = re.sub(r"[^\w.-]+", "-", sequence.absolute().name).strip(".-") or "scan"
+            names = (stem if number == 1 else f"{stem}-{number}" for number in range(1, 10_000))
+            folder = next(self.out / name for name in names if not (self.out / name).exists())
+        if folder not in self._scans:
+            scan = self._scans[folder] = Scan(folder, kept.get(folder, Choices(place)), self.queue)
+            scan._choose()
+        self.show(self._scans[folder])
+        return self._scans[folder]
+
+    def show(self, scan: Scan) -> None:
+        """Have all pages show a scan."""
+        self.current = scan
+        self.version += 1
+
+    def known(self, name: str) -> Scan | None:
+        """Return the scan of a name, if it has been opened."""
+        return self._scans.get(self.out / name)
+
+    def folders(self) -> list[Path]:
+        """Return the folders of scans, the newest first."""
+        found = [path.parent for path in self.out.glob(f"*/{STATE}")]
+        return sorted(found, key=lambda folder: (folder / STATE).stat().st_mtime, reverse=True)
