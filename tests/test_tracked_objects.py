@@ -17,8 +17,9 @@ from modeler.sequences.rendering.recipe import Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.tracking import ModelRenderer, Tracked, Tracker
 from modeler.tracking.errors import of_the_camera, of_the_model
-from modeler.types import Array, Camera, InputError, ObjectModel
+from modeler.types import Array, Camera, Frame, InputError, ObjectModel, PoseGaussian
 from modeler.views import Sensor
+from modeler.views.thinning import thinned
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, staged
 from studies.tracking.clutter import model_of as model_on_table
@@ -154,6 +155,42 @@ def test_a_model_without_seen_surface_is_refused() -> None:
         Tracker(unseen)
 
 
+def test_a_frame_is_thinned_to_pixels_of_the_same_rays() -> None:
+    sequence, _ = rendered("boot")
+    frame = sequence.frame(0)
+    for step in (2, 3):
+        small, sensor = thinned(frame, Sensor(), step)
+        w, h = frame.camera.rays()
+        start = (step - 1) // 2
+        assert np.allclose(small.camera.rays()[0], w[start::step, start::step])
+        assert np.allclose(small.camera.rays()[1], h[start::step, start::step])
+        assert np.array_equal(small.depth_m, frame.depth_m[start::step, start::step], equal_nan=True)
+        assert sensor.noise.sigma_colour_px == Sensor().noise.sigma_colour_px / step
+
+
+def striped(camera_from_model: Array) -> tuple[Frame, ModelRenderer]:
+    """A photograph of a wide box with random stripes, and the renderer of its model."""
+    box = trimesh.creation.box((0.3, 0.2, 0.1))
+    model = model_of(trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(box.vertices, box.faces, 0.004)))
+    stripes = np.random.default_rng(0).integers(20, 235, 400)
+    grey = stripes[np.floor((model.vertices_m[:, 0] + model.vertices_m[:, 1]) / 0.006).astype(int)]
+    renderer = ModelRenderer(replace(model, vertex_colours=np.repeat(grey[:, None], 3, axis=1).astype(np.uint8)))
+    view = renderer.view(camera_from_model, CAMERA, Sensor(), most_px=np.inf)
+    return replace(view.frame, index=0, occluder=None), renderer
+
+
+def test_colours_of_a_wide_object_tell_half_turns_apart() -> None:
+    pose = se3.exp(np.array([0.4, 0.3, 0.1, 0.0, 0.0, 0.0]))
+    pose[:3, 3] = [0.02, 0.0, 0.42]
+    frame, renderer = striped(pose)
+    found = Tracker(renderer.model, independent=True).update(frame)
+    assert found.view is not None
+    assert found.view.frame.camera.fx < frame.camera.fx  # wider than is of use
+    assert found.pose is not None
+    assert not found.modes
+    assert np.degrees(se3.rotation_angle(se3.inverse(found.pose.mean) @ pose)) < 1.0
+
+
 def ball_at(distance_m: float, radius_m: float = 0.05) -> tuple[ModelRenderer, Array]:
     ball = model_of(trimesh.creation.icosphere(subdivisions=5, radius=radius_m))
     return ModelRenderer(ball), se3.translation(np.array([0.05, -0.02, distance_m]))
@@ -192,7 +229,9 @@ def test_a_models_error_moves_a_ball_but_turns_it_not() -> None:
     renderer, pose = ball_at(0.6)
     model = replace(renderer.model, vertex_sigmas_m=np.full(len(renderer.model.vertices_m), 1e-3))
     renderer = ModelRenderer(model)
-    covariance = of_the_model(renderer.view(pose, CAMERA, Sensor()), pose, renderer)
+    seen, away = renderer.view(pose, CAMERA, Sensor()), 1e-4 * np.eye(6)
+    away[3:, 3:] = 1e-8 * np.eye(3)  # something besides surface tells the turn of the ball
+    covariance = of_the_model(seen, PoseGaussian(pose, away), renderer)
     assert np.sqrt(np.trace(covariance[:3, :3])) < np.radians(0.2)
     assert 2e-4 < np.sqrt(np.trace(covariance[3:, 3:])) < 3e-3
 

@@ -10,7 +10,7 @@ import rerun as rr
 
 from modeler import se3
 from modeler.tracking import ModelRenderer, Tracked
-from modeler.types import Frame, ObjectModel
+from modeler.types import BoolArray, Frame, ObjectModel
 from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, POINT_SIZE, Drawing, ellipsoids
 from modeler.viz.images import draw_outlined, stride_px
@@ -27,8 +27,7 @@ def draw_tracked_model(model: ObjectModel) -> Drawing:
 def draw_tracked(frame: Frame, found: Tracked, renderer: ModelRenderer) -> Drawing:
     """Yield a frame with the model's outline, and in 3D the model in its pose among the points of the object."""
     if found.pose is None:
-        mask = np.zeros(frame.depth_m.shape, dtype=bool) if found.view is None else found.view.frame.mask
-        yield from draw_outlined(frame, np.zeros(frame.depth_m.shape, dtype=bool) if mask is None else mask)
+        yield from draw_outlined(frame, _sought(found, frame))
         yield entities.TRACKED_MODEL, rr.Transform3D(scale=1e-9)  # not in sight
         yield entities.TRACKED_PLACE_3_SIGMA, CLEAR
     else:
@@ -53,6 +52,16 @@ def draw_tracked(frame: Frame, found: Tracked, renderer: ModelRenderer) -> Drawi
         points_m = found.view.points_m[::stride]
         yield entities.TRACKED_POINTS, rr.Points3D(points_m, colors=entities.SOURCE_RGB, radii=POINT_SIZE)
     yield entities.TRACKED_WORDS, rr.TextDocument(words(found), media_type=rr.MediaType.MARKDOWN)
+
+
+def _sought(found: Tracked, frame: Frame) -> BoolArray:
+    """Return the pixels (h, w) of a frame in which the object was looked for."""
+    mask: BoolArray = np.zeros((frame.camera.height, frame.camera.width), dtype=bool)
+    if found.view is not None and found.view.frame.mask is not None:
+        step = round(frame.camera.fx / found.view.frame.camera.fx)  # registration may use every few pixels
+        wide = found.view.frame.mask.repeat(step, axis=0).repeat(step, axis=1)[: len(mask), : mask.shape[1]]
+        mask[: len(wide), : wide.shape[1]] = wide
+    return mask
 
 
 def words(found: Tracked) -> str:

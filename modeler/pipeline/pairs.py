@@ -26,6 +26,8 @@ from modeler.views import Sensor
 
 BEYOND_LIMITS_NATS: Final = 7.0
 """Prior log odds of a motion within the prior's limits: one in a thousand exceeds them."""
+SEGMENTED: Final = (Outcome.CONVERGED, Outcome.UNSURE_MASK, Outcome.CUT_OFF)
+"""Outcomes of a segmentation that has found an object."""
 _CONTRADICTED_NATS: Final = 4.6
 """Log odds against a match that the images contradict: they contradict one of 100 right ones (`Posterior`)."""
 
@@ -65,7 +67,7 @@ def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) ->
         sensor: of the camera.
     """
     segmentation = segmenter.segment(frame, scene)
-    if segmentation.outcome not in (Outcome.CONVERGED, Outcome.UNSURE_MASK, Outcome.CUT_OFF):
+    if segmentation.outcome not in SEGMENTED:
         return Prepared(frame, segmentation, None)
     view = sensor.ray_image(replace(frame, mask=segmentation.mask), segmentation.plane)
     return Prepared(frame, segmentation, view if len(view.points_m) else None)

@@ -66,7 +66,7 @@ class TrackFolder:
             return
         began_s = time.monotonic()
         report = {"schema": 1, "model": self.model, "sequence": self.sequence, "poses": [record(one) for one in found]}
-        placed = {one.frame: one.pose.mean for one in found if one.pose is not None}
+        placed = {one.frame: one.pose.mean for one in found if one.pose is not None and one.outcome != "unsure"}
         contents = {
             "trajectory.txt": tum_text(placed, {one.frame: one.time_s for one in found}),
             "bop.csv": bop_text(found, *_numbers(self.sequence, self.model)),

@@ -9,36 +9,36 @@ import numpy as np
 from modeler import se3
 from modeler.fusion.symmetries import Symmetries
 from modeler.tracking.rendering import ModelRenderer
-from modeler.types import Array, RayImage
+from modeler.types import Array, PoseGaussian, RayImage
 
 PATCHES: Final = 8.0
 """Number of patches of the surface that a view shows in which errors of a fused model are alike."""
-_OPEN = 1e-3  # of the best determined direction's information: surface says nothing of less
 
 
-def of_the_model(seen: RayImage, camera_from_model: Array, renderer: ModelRenderer) -> Array:
+def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) -> Array:
     """Return the covariance (6, 6) of ξ in camera_from_model · Exp(ξ) due to the model's errors.
 
-    Least squares of point-to-plane distances have rows a = (p × n, n). If distances err by σ, alike within each of
-    K patches, the covariance of the solution is σ² (Σ a aᵀ / N)⁻¹ / K (method, eq. 15.1). Directions that surface
-    leaves open are left out.
+    Point-to-plane distances have rows a = (p × n, n), with mean B of a aᵀ. If distances err by σ, alike within each of
+    K patches, a solution of covariance C is moved with the covariance (σ² / K) (s C) B (s C) (method, eq. 15.1). In the
+    direction in which surface tells most, it tells nearly all: 1 / s is the largest eigenvalue of C B. What colours and
+    outlines tell keeps other directions in place.
 
     Args:
         seen: the model in the pose.
-        camera_from_model: (4, 4).
+        pose: camera_from_model, and the covariance C of ξ if the model is exact.
         renderer: of the model.
     """
     if not len(seen.points_m):
         return np.zeros((6, 6))
-    model_from_camera = se3.inverse(camera_from_model)
+    model_from_camera = se3.inverse(pose.mean)
     arms = se3.transform(model_from_camera, seen.points_m) - renderer.centre_m
     normals = seen.normals @ model_from_camera[:3, :3].T
-    scale = np.repeat([1.0 / renderer.radius_m, 1.0], 3)  # so that rotations compare with shifts
-    rows = np.concatenate([np.cross(arms, normals), normals], axis=1) * scale
-    values, axes = np.linalg.eigh(rows.T @ rows / len(rows))
-    spread = np.where(values > _OPEN * values[-1], 1.0 / np.maximum(values, 1e-12), 0.0)
-    about = renderer.sigma_m**2 / PATCHES * (axes * spread) @ axes.T * np.outer(scale, scale)
-    return se3.covariance_about(about, -renderer.centre_m)
+    rows = np.concatenate([np.cross(arms, normals), normals], axis=1)
+    surface = rows.T @ rows / len(rows)
+    about = se3.covariance_about(pose.covariance, renderer.centre_m)
+    root = np.linalg.cholesky(about)
+    gain = about / np.linalg.eigvalsh(root.T @ surface @ root)[-1]
+    return se3.covariance_about(renderer.sigma_m**2 / PATCHES * gain @ surface @ gain.T, -renderer.centre_m)
 
 
 def of_the_camera(camera_from_model: Array, centre_m: Array, sigma_focal: float, depth_scale_sigma: float) -> Array:

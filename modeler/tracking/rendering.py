@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, final
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 _MARGIN = 0.35  # of a rendered image beside the model, as a share of the model's width: poses nearby fall into it
 FINE_PX, COARSE_PX = 200.0, 64.0
-"""Width of the model in a rendered image at most: finer ones do not make poses more precise; enough for a search."""
+"""Width of the model in an image: finer ones do not make poses more precise; enough for a search."""
+MOST_PX = 2.0 * FINE_PX
+"""Width of a rendered model at most; in poses near that of a frame of about `FINE_PX` it is narrower."""
 _FAR = 100.0  # times the object's distance: depth beside a model, where nothing is
 _MISSING_SHARE = 0.33  # of a closed model's surface; half a ball, as what was seen from one side, lacks a third
 
@@ -75,7 +78,7 @@ class ModelRenderer:
         camera: Camera,
         sensor: Sensor,
         *,
-        most_px: float = FINE_PX,
+        most_px: float = MOST_PX,
         index: int = -1,
         time_s: float = 0.0,
         plane: Plane | None = None,
@@ -92,10 +95,10 @@ class ModelRenderer:
             plane: support plane of the view.
         """
         camera, step = self._cropped(camera_from_model, camera, most_px)
-        depth_m, seen, unknown, found = self._cast(camera_from_model, camera)
+        depth_m, seen, unknown, hits = self._cast(camera_from_model, camera)
         colour = None
         if self.model.vertex_colours is not None:
-            colour = np.rint(self._at_hits(self.model.vertex_colours.astype(np.float64), found)).astype(np.uint8)
+            colour = hits.image(np.rint(hits.interpolated(self.model.vertex_colours)).astype(np.uint8), depth_m.shape)
         frame = Frame(index, time_s, depth_m, camera, seen, colour, unknown)
         smoothing = sensor.smoothing if self.model.vertex_sigmas_m is None else 0.0
         exact = replace(
@@ -107,7 +110,9 @@ class ModelRenderer:
         )
         view = exact.ray_image(frame, plane)
         view = replace(view, sigma_focal=0.0, range_noise_m=self.sigma_m, rendered=True)
-        return view if self.model.vertex_sigmas_m is None else _with_variances(view, self._variances(found))
+        if self._sigmas_m is None:
+            return view
+        return _with_variances(view, hits.image(hits.interpolated(self._sigmas_m) ** 2, depth_m.shape))
 
     def silhouette(self, camera_from_model: Array, camera: Camera, stride: int = 1) -> tuple[BoolArray, Array]:
         """Return where (h, w) the model covers the image, and its depth (h, w) in m there, infinite elsewhere.
@@ -145,34 +150,50 @@ class ModelRenderer:
 
     def _cast(
         self, camera_from_model: Array, camera: Camera
-    ) -> tuple[npt.NDArray[np.float32], BoolArray, BoolArray, tuple[npt.NDArray[np.int64], Array]]:
-        """Return depth (h, w) in m, where seen surface is, where nothing is known, and which triangle is met where."""
+    ) -> tuple[npt.NDArray[np.float32], BoolArray, BoolArray, _Hits]:
+        """Return depth (h, w) in m, where seen surface is, where nothing is known, and where rays meet the surface."""
         import open3d as o3d
 
-        rays = _rays(camera_from_model, *camera.rays())
-        hits = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
-        depth_m = hits["t_hit"].numpy()
-        met = np.isfinite(depth_m)
-        triangle = np.where(met, hits["primitive_ids"].numpy(), 0).astype(np.int64)
-        second, third = np.moveaxis(hits["primitive_uvs"].numpy().astype(np.float64), -1, 0)
-        weights = np.stack([1.0 - second - third, second, third], axis=-1)
-        facing = np.sum(hits["primitive_normals"].numpy() * rays[..., 3:], axis=-1) < 0.0
-        seen = met & facing & self._seen[triangle]
-        unknown = met & ~seen if self.closed else ~seen
-        far_m = np.float32(_FAR * np.linalg.norm(camera_from_model[:3, 3]))
-        return np.where(met, depth_m, far_m).astype(np.float32), seen, unknown, (triangle, weights)
+        shape, window = (camera.height, camera.width), self._window(camera_from_model, camera)
+        rays = _rays(camera_from_model, *(axis[window] for axis in camera.rays()))
+        found = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
+        near_m = found["t_hit"].numpy()
+        met = np.isfinite(near_m)
+        rows, columns = np.nonzero(met)
+        triangle = found["primitive_ids"].numpy()[met]
+        second, third = found["primitive_uvs"].numpy()[met].T
+        corners = self.model.triangles[triangle]
+        hits = _Hits(rows + window[0].start, columns + window[1].start, corners, second, third)
+        facing = np.sum(found["primitive_normals"].numpy()[met] * rays[met][:, 3:], axis=1) < 0.0
+        seen = hits.image(facing & self._seen[triangle], shape)
+        depth_m = np.full(shape, _FAR * np.linalg.norm(camera_from_model[:3, 3]), dtype=np.float32)
+        depth_m[hits.rows, hits.columns] = near_m[met]
+        unknown = hits.image(np.ones(len(rows), dtype=bool), shape) & ~seen if self.closed else ~seen
+        return depth_m, seen, unknown, hits
 
-    def _at_hits(self, values: Array, found: tuple[npt.NDArray[np.int64], Array]) -> Array:
-        """Return values of vertices (v, …), interpolated where rays meet the surface (h, w, …)."""
-        triangle, weights = found
-        corners = values[self.model.triangles[triangle]]
-        return np.einsum("hwk,hwk...->hw...", weights, corners)
+    def _window(self, camera_from_model: Array, camera: Camera) -> tuple[slice, slice]:
+        """Return the rows and columns of an image in which the model may be."""
+        corners = se3.transform(camera_from_model, self._corners_m)
+        if corners[:, 2].min() <= 0.0:
+            return slice(0, camera.height), slice(0, camera.width)
+        x, y = corners[:, 0] / corners[:, 2], corners[:, 1] / corners[:, 2]
+        ends = [
+            np.clip([np.floor(place.min()), np.ceil(place.max()) + 1], 0, size).astype(int)
+            for place, size in ((camera.fy * y + camera.cy, camera.height), (camera.fx * x + camera.cx, camera.width))
+        ]
+        return slice(*ends[0]), slice(*ends[1])
 
-    def _variances(self, found: tuple[npt.NDArray[np.int64], Array]) -> Array:
-        """Return the variance (h, w) in m² of the surface along its normal."""
+    @cached_property
+    def _corners_m(self) -> Array:
+        """Corners (8, 3) of the box around the model."""
+        ends = self.model.vertices_m.min(axis=0), self.model.vertices_m.max(axis=0)
+        return np.array(list(itertools.product(*zip(*ends, strict=True))))
+
+    @cached_property
+    def _sigmas_m(self) -> Array | None:
+        """Standard deviation (v,) of vertices along their normals, 0 where unknown; None without any."""
         sigmas_m = self.model.vertex_sigmas_m
-        assert sigmas_m is not None
-        return self._at_hits(np.where(np.isfinite(sigmas_m), sigmas_m, 0.0), found) ** 2
+        return None if sigmas_m is None else np.where(np.isfinite(sigmas_m), sigmas_m, 0.0)
 
     @cached_property
     def _seen(self) -> BoolArray:
@@ -195,6 +216,35 @@ class ModelRenderer:
             tensor(self.model.vertices_m.astype(np.float32)), tensor(self.model.triangles.astype(np.uint32))
         )
         return scene
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Hits:
+    """Where rays meet the surface of a model."""
+
+    rows: npt.NDArray[np.int64]
+    """(n,) of the pixels."""
+    columns: npt.NDArray[np.int64]
+    """(n,) of the pixels."""
+    corners: npt.NDArray[np.int64]
+    """(n, 3) vertices of the triangles."""
+    second: npt.NDArray[np.float32]
+    """(n,) weight of the second vertex."""
+    third: npt.NDArray[np.float32]
+    """(n,) weight of the third."""
+
+    def interpolated(self, values: np.ndarray) -> Array:
+        """Return values (n, …) of vertices (v, …) where rays meet the surface."""
+        one, two, three = (values[corner].astype(np.float64) for corner in self.corners.T)
+        second, third = (weight.reshape(-1, *[1] * (values.ndim - 1)) for weight in (self.second, self.third))
+        return one + second * (two - one) + third * (three - one)
+
+    def image(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """Return an image (h, w, …) of values (n, …), 0 elsewhere."""
+        found = np.zeros((*shape, *values.shape[1:]), dtype=values.dtype)
+        found[self.rows, self.columns] = values
+        return found
 
 
 def _rays(camera_from_model: Array, w: Array, h: Array) -> npt.NDArray[np.float32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import final
+from typing import Final, final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,7 +13,7 @@ from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration import VisibilityLikelihood
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.search import Search
-from modeler.tracking.rendering import COARSE_PX, ModelRenderer
+from modeler.tracking.rendering import COARSE_PX, MOST_PX, ModelRenderer
 from modeler.types import Array, Camera, RayImage
 from modeler.views import Sensor
 
@@ -21,6 +21,8 @@ _STRIDE = 4  # every fourth point is scored at the start
 _DISTINCT_RAD = 0.2  # the extent of a basin of attraction
 _MIN_POINTS = 20  # of a view, as of the registrar
 _NEAR = 1.15  # ratio of distances from which the model looks about the same
+RIVAL_NATS: Final = 12.0
+"""Below the best pose, a pose of the search is negligible: twice the log of a negligible share."""
 
 
 @final
@@ -73,7 +75,7 @@ class ViewpointSearch:
     descended: int = 3
     """Of these, the best descend."""
     refined: int = 24
-    """Best poses of all viewpoints that descend once more, in a finer view of the model where they ended."""
+    """Best poses of all viewpoints that descend once more, in a view of the model where they ended."""
     coarse: VisibilityLikelihood = field(default_factory=lambda: VisibilityLikelihood(points=240, colour=False))
     """Compares the frame with viewpoints."""
     fine: VisibilityLikelihood = field(default_factory=lambda: VisibilityLikelihood(points=300))
@@ -99,18 +101,36 @@ class ViewpointSearch:
         )
 
     def again(
-        self, renderer: ModelRenderer, poses: Array, view: RayImage, sensor: Sensor, rng: np.random.Generator
+        self,
+        renderer: ModelRenderer,
+        rough: tuple[Array, Array],
+        view: RayImage,
+        sensor: Sensor,
+        rng: np.random.Generator,
     ) -> tuple[Array, Array]:
-        """Return the best of rough poses (n, 4, 4) after descent in finer views of the model there, as `roughly` does.
+        """Return the best of rough poses after descent in views of the model where they ended, as `roughly` does.
+
+        Those that are left as rivals, before or after it, descend once more in views as fine as the frame, with
+        colours, whose bands are then alike: coarse surface alone may lead a flat object astray along its open shift.
 
         Args:
             renderer: of the model.
-            poses: camera_from_model, the likeliest first.
+            rough: camera_from_model (n, 4, 4) and their log-likelihoods, the likeliest first.
             view: the frame, segmented.
             sensor: of the frame.
             rng: source of all randomness.
         """
-        return _ranked([self._again(renderer, pose, view, sensor, rng) for pose in poses[: self.refined]])
+
+        def descended(poses: Array, model: VisibilityLikelihood, most_px: float) -> list[tuple[Array, Array]]:
+            views = [renderer.view(pose, view.frame.camera, sensor, most_px=most_px) for pose in poses]
+            return [
+                self._descended(model.between(view, seen, rng), _here_and_centred(view, seen), pose)
+                for pose, seen in zip(poses, views, strict=True)
+                if len(seen.points_m) >= _MIN_POINTS
+            ]
+
+        near, scores = _ranked([rough, *descended(rough[0][: self.refined], self.coarse, COARSE_PX)])
+        return _ranked(descended(near[scores > scores[:1] - RIVAL_NATS], self.fine, MOST_PX))
 
     def _from_viewpoint(
         self, seen: RayImage, camera_from_model: Array, view: RayImage, rng: np.random.Generator
@@ -126,15 +146,6 @@ class ViewpointSearch:
         scores = pair.tempered(starts, 2.0 * self.search.blurs_m(pair)[0], stride=_STRIDE)
         return self._descended(pair, starts[np.argsort(-scores, kind="stable")[: self.descended]], camera_from_model)
 
-    def _again(
-        self, renderer: ModelRenderer, pose: Array, view: RayImage, sensor: Sensor, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """Return camera_from_model (1, 4, 4) after descent in the view of the model there, and its log-likelihood."""
-        seen = renderer.view(pose, view.frame.camera, sensor)
-        if len(seen.points_m) < _MIN_POINTS:
-            return np.zeros((0, 4, 4)), np.zeros(0)
-        return self._descended(self.fine.between(view, seen, rng), np.eye(4)[None], pose)
-
     def _descended(self, pair: PairLikelihood, poses: Array, camera_from_model: Array) -> tuple[Array, Array]:
         """Return camera_from_model (k, 4, 4) after descent from poses of the pair, and log-likelihoods (k,)."""
         damping = 0.0025 * pair.points / self.search.extent(pair) ** 2
@@ -142,6 +153,14 @@ class ViewpointSearch:
         for blur_m in self.search.blurs_m(pair):
             poses = pair.descend(poses, blur_m, regulariser, steps=self.search.steps)
         return se3.inverse(poses) @ camera_from_model, pair.tempered(poses, self.search.fine_m(pair))
+
+
+def _here_and_centred(view: RayImage, seen: RayImage) -> Array:
+    """Return motions (2, 4, 4) from a view to that of a model: none, and the shift of one centroid to the other.
+
+    Surface that is nearly a plane does not tell how far it is along itself, so that descent may end beside it.
+    """
+    return np.stack([np.eye(4), se3.translation(seen.centroid_m - view.centroid_m)])
 
 
 def _ranked(found: list[tuple[Array, Array]]) -> tuple[Array, Array]:

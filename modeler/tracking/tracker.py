@@ -14,7 +14,7 @@ from modeler import se3
 from modeler.fusion import SymmetryFinder
 from modeler.fusion.symmetries import Symmetries
 from modeler.kernels import point_likelihood
-from modeler.pipeline.pairs import prepare
+from modeler.pipeline.pairs import SEGMENTED
 from modeler.priors.mixtures import KernelMixture
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.posterior import MIN_MODE_SHARE
@@ -23,12 +23,13 @@ from modeler.registration.visibility.search import Search
 from modeler.segmentation import Scene, Segmenter
 from modeler.tracking.candidates import CandidateFinder
 from modeler.tracking.errors import free_directions, of_the_camera, of_the_model
-from modeler.tracking.rendering import ModelRenderer
-from modeler.tracking.search import Viewpoints, ViewpointSearch
+from modeler.tracking.rendering import FINE_PX, ModelRenderer
+from modeler.tracking.search import RIVAL_NATS, Viewpoints, ViewpointSearch
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
     Array,
+    BoolArray,
     Frame,
     InputError,
     Mode,
@@ -40,8 +41,9 @@ from modeler.types import (
     pooled,
 )
 from modeler.views import Sensor
+from modeler.views.thinning import thinned
 
-Presence = Literal["found", "followed", "not there", "too few points"]
+Presence = Literal["found", "followed", "unsure", "not there", "too few points"]
 
 USABLE_RAD, USABLE_M = np.radians(3.0), 0.005
 """Largest standard deviations, of a rotation and of the object's place, with which a pose is of use."""
@@ -55,7 +57,6 @@ _OVERLAP, _SHOWN = 0.6, 0.3  # least, with any rotation: a small part of a model
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
 _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
 _MOST_TRIED = 3  # of the segments of a frame, the likeliest
-_RIVAL_NATS = 12.0  # below the best pose, a search's pose is negligible
 
 
 @final
@@ -68,7 +69,10 @@ class Tracked:
     time_s: float
     """Time of the frame."""
     outcome: Presence
-    """`found` without knowledge of the frames before, `followed` from these, or neither."""
+    """`found` without knowledge of the frames before, `followed` from these, or neither.
+
+    It is `unsure` if the images leave a rotation open that is no symmetry of the model: others may match as well.
+    """
     pose: PoseGaussian | None = None
     """camera_from_model, its covariance with the errors of model and camera; None where the object is not there."""
     modes: tuple[Mode, ...] = ()
@@ -154,7 +158,7 @@ class Tracker:
         began_s = time.perf_counter()
         found = self._placed(frame, np.random.default_rng([self.seed, max(frame.index, 0)]))
         found = replace(found, seconds=time.perf_counter() - began_s)
-        if found.pose is None:
+        if found.pose is None or found.outcome == "unsure":
             self.newest.clear()
         else:
             self.newest = [*self.newest[-1:], found]
@@ -185,8 +189,22 @@ class Tracker:
 
     def _view(self, frame: Frame) -> RayImage | None:
         """Return a frame prepared for registration; None if too little of an object is seen."""
-        view = prepare(frame, self.scene, self.segmenter, self.sensor).view
-        return None if view is None or len(view.points_m) < self.registrar.min_points else view
+        segmented = self.segmenter.segment(frame, self.scene)
+        if segmented.outcome not in SEGMENTED:
+            return None
+        frame, sensor = thinned(replace(frame, mask=segmented.mask), self.sensor, self._step(frame, segmented.mask))
+        view = sensor.ray_image(frame, segmented.plane)
+        return None if len(view.points_m) < self.registrar.min_points else view
+
+    def _step(self, frame: Frame, mask: BoolArray) -> int:
+        """Return which pixels of a frame are of use for an object in a mask (h, w): every so many."""
+        rows, columns = np.nonzero(mask & (frame.depth_m > 0.0))
+        if not len(rows):
+            return 1
+        seen_px = float(np.hypot(np.ptp(rows), np.ptp(columns)))
+        model_px = 2.0 * self.renderer.radius_m * frame.camera.fx / float(np.median(frame.depth_m[rows, columns]))
+        # Half of it may be hidden; more is not believed, as the model may be in another unit.
+        return max(round(min(model_px, 2.0 * seen_px) / FINE_PX), 1)
 
     def _followed(self, view: RayImage, rng: np.random.Generator) -> Tracked | None:
         """Return the object as predicted from the frames before, None if nothing is or the images contradict that."""
@@ -250,7 +268,7 @@ class Tracker:
             self._check_size(view)
             distance_m = float(np.linalg.norm(view.centroid_m)) + 0.5 * self.renderer.radius_m
             poses, scores = self.search.roughly(self._viewpoints(view, distance_m), view, rng)
-            rough += [(scores[0], poses, view)] if len(poses) else []
+            rough += [(scores[0], (poses, scores), view)] if len(poses) else []
         rough.sort(key=lambda one: -one[0])
         absent = nothing
         for _, poses, view in rough[:_MOST_TRIED]:
@@ -262,9 +280,9 @@ class Tracker:
         return absent
 
     def _in_view(
-        self, view: RayImage, rough: Array, rng: np.random.Generator, unmasked: Frame | None = None
+        self, view: RayImage, rough: tuple[Array, Array], rng: np.random.Generator, unmasked: Frame | None = None
     ) -> Tracked:
-        """Return the object in a view, near one of rough poses (k, 4, 4), the likeliest first.
+        """Return the object in a view, near one of rough poses (k, 4, 4), with scores (k,), the likeliest first.
 
         A guessed mask that has too much or too little gets a second chance, with what is near the pose found in it.
         """
@@ -272,7 +290,7 @@ class Tracker:
         poses, scores = self.search.again(self.renderer, rough, view, self.sensor, rng)
         if not len(poses):
             return absent
-        likely = poses[scores > scores[0] - _RIVAL_NATS][: self.registrar.max_modes]
+        likely = poses[scores > scores[0] - RIVAL_NATS][: self.registrar.max_modes]
         registered = [(self._registered(view, pose, rng), pose) for pose in likely]
         convincing = [(posterior, pose) for posterior, pose in registered if posterior.convincing]
         if not convincing:
@@ -281,7 +299,7 @@ class Tracker:
                 reached = se3.inverse(best.pose.mean) @ about
                 better = self._view(replace(unmasked, mask=self.finder.near(unmasked, reached, self.renderer)))
                 if better is not None:
-                    return self._in_view(better, reached[None], rng)
+                    return self._in_view(better, (reached[None], np.full(1, -np.inf)), rng)
             reason = "the images contradict the likeliest pose" if best.usable else best.outcome.label
             return replace(absent, overlap=best.overlap, reason=reason)
         pairs = [self._pair(view, se3.inverse(posterior.pose.mean) @ pose, rng) for posterior, pose in convincing]
@@ -352,6 +370,9 @@ class Tracker:
         if reason:  # perhaps only because of the model's symmetries
             reason = self._doubt(modes, self.symmetries)
             free = free_directions(self.symmetries, coloured=view.frame.colour is not None)
+            open_rad, _ = self._sigmas(modes[0].pose, self.symmetries)
+            if outcome == "found" and np.degrees(open_rad) > self.registrar.max_sigma_deg:
+                outcome = "unsure"
         modes = [Mode(mode.weight, self._of_camera(mode.pose, view, free)) for mode in modes]
         return Tracked(
             view.index,
@@ -370,7 +391,7 @@ class Tracker:
         if self.renderer.sigma_m == 0.0:
             return pose
         seen = self.renderer.view(pose.mean, view.frame.camera, self.sensor)
-        return replace(pose, covariance=pose.covariance + of_the_model(seen, pose.mean, self.renderer))
+        return replace(pose, covariance=pose.covariance + of_the_model(seen, pose, self.renderer))
 
     def _of_camera(self, pose: PoseGaussian, view: RayImage, free: Array) -> PoseGaussian:
         """Return a pose with the errors of the camera, and a covariance (6, 6) of what nothing shows."""
@@ -385,15 +406,18 @@ class Tracker:
             apart = [se3.rotation_angle(se3.inverse(first.mean @ turn) @ mode.pose.mean) for turn in turns]
             if not found.continuous and min(apart) > _SIGMA_RAD:
                 return "several poses explain the image"
-        about = se3.covariance_about(first.covariance, self.renderer.centre_m)
-        across = np.eye(3)
-        for axis in found.continuous:
-            across = across @ (np.eye(3) - np.outer(axis.direction, axis.direction))
-        sigma_rad = np.sqrt(np.linalg.eigvalsh(across.T @ about[:3, :3] @ across)[-1])
-        sigma_m = np.sqrt(np.linalg.eigvalsh(about[3:, 3:])[-1])
+        sigma_rad, sigma_m = self._sigmas(first, found)
         if sigma_rad > USABLE_RAD:
             return f"its rotation is uncertain by {np.degrees(sigma_rad):.1f}°"
         return f"its place is uncertain by {1000.0 * sigma_m:.1f} mm" if sigma_m > USABLE_M else ""
+
+    def _sigmas(self, pose: PoseGaussian, symmetries: Symmetries) -> tuple[float, float]:
+        """Return the largest standard deviations: of a rotation in rad, but about axes of revolution, and in m."""
+        about, across = se3.covariance_about(pose.covariance, self.renderer.centre_m), np.eye(3)
+        for axis in symmetries.continuous:
+            across = across @ (np.eye(3) - np.outer(axis.direction, axis.direction))
+        sigma_rad = np.sqrt(np.linalg.eigvalsh(across.T @ about[:3, :3] @ across)[-1])
+        return float(sigma_rad), float(np.sqrt(np.linalg.eigvalsh(about[3:, 3:])[-1]))
 
     def _viewpoints(self, view: RayImage, distance_m: float) -> Viewpoints:
         """Return the viewpoints at a distance, those of earlier searches if they suit."""
