@@ -61,6 +61,7 @@ def untrusted(
         (untrusted("unsure_focal"), priors.TablePrior(), {"camera": "camera.json"}),
         (untrusted("prior_contradicted"), priors.TurntablePrior(25.0, 2.0), {"step_sigma_deg": "6"}),
         (untrusted("prior_contradicted"), priors.TablePrior(), {"prior": "general"}),
+        (untrusted("left_out", "colour_misaligned", "loop_open"), priors.TablePrior(), {"no_colour": ""}),
         (untrusted("never_came_back"), priors.GeneralPrior(), None),
         (
             untrusted("left_out", turn_deg=48.0, outcome=Outcome.AT_LIMIT),

@@ -80,6 +80,7 @@ def modeler(
         registrar=chosen,
         closer=Closer(),
         fuser=Fuser(),
+        colour=method.colour,
         seed=method.seed,
     )
 

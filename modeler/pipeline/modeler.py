@@ -83,6 +83,8 @@ class Modeler:
     tolerance_m: float | None = None
     """Error of the surface above which a model is called wrong; None: a share of the object's size, at least what the
     camera's noise allows."""
+    colour: bool = True
+    """Whether colour is to fit depth for a model to be trusted."""
     seed: int = 0
     """Each pair has its own random generator, seeded with this and the two frame numbers."""
     cache: AbstractPairCache | None = None
@@ -338,6 +340,7 @@ class Run:
             prior=self.modeler.prior,
             depth_scale_sigma=self.depth_scale_sigma,
             tolerance_m=self.modeler.tolerance_m,
+            colour=self.modeler.colour,
         )
         yield replace(last, verdict=verdict)
 

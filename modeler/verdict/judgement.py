@@ -33,6 +33,7 @@ from modeler.types import (
     loops_closed,
     segments,
 )
+from modeler.verdict.colour_fit import colour_fit
 from modeler.verdict.evidence import (
     MAX_UNSURE,
     FreeSpace,
@@ -65,6 +66,7 @@ def judged(
     prior: AbstractPrior | None = None,
     depth_scale_sigma: float = 0.0,
     tolerance_m: float | None = None,
+    colour: bool = True,
 ) -> Verdict:
     """Judge the model of a run. Evidence is gathered after the last step, when all edges are in.
 
@@ -75,6 +77,7 @@ def judged(
         prior: of the motions; None: not known here.
         depth_scale_sigma: standard deviation of the depth scale's logarithm, as the camera was given; 0 = exact.
         tolerance_m: error of the surface above which a model is wrong; None: `default_tolerance_m`.
+        colour: whether colour is to fit depth.
     """
     reasons, frames = [], step.frames_so_far
     tolerance_m = default_tolerance_m(step.views.values()) if tolerance_m is None else tolerance_m
@@ -89,6 +92,7 @@ def judged(
     reasons += [Shortcoming("left_out", words) for words in _left_out(frames, segments(edges))]
     free = free_space(step.views, step.solution.trajectory, tolerance_m) if step.last else None
     found = _found(step, frames, edges, prior, tolerance_m, free=free) if step.last else []
+    found += _colour(step) if step.last and colour else []
     reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _unconfirmed_join(edges)
@@ -188,6 +192,18 @@ def _found(
     words = f"with a probability of {100.0 * others.value:.0f} %, some pair is at a wrong mode"
     found.append(_Finding("other_modes", others, "other_modes", words))
     return found
+
+
+def _colour(step: Step) -> list[_Finding]:
+    """Return whether colour fits depth, if surface that two views see has colour."""
+    fit = colour_fit(step.views, step.solution.trajectory)
+    if fit is None:
+        return []
+    words = (
+        "colour does not fit depth: its correlation on surface that two frames see is "
+        f"{fit.correlation:.2f}, and {fit.elsewhere:.2f} if it {fit.displacement}: is it aligned?"
+    )
+    return [_Finding("colour_fit", fit.check, "colour_misaligned", words)]
 
 
 def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Finding]:

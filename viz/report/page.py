@@ -422,6 +422,13 @@ CHECKS: Final = {
         100.0,
         " %",
     ),
+    "colour_fit": Check(
+        "agreement of colours on surface that two frames see",
+        "Correlation of the print, as a share of the best one with colour shifted, scaled, mirrored or of another "
+        "frame. Less: colour is not aligned to depth.",
+        100.0,
+        " %",
+    ),
     "pose_sd_deg": Check(
         "largest sd of a pose's rotation", "At the limit, one pose in twenty is off by more than 3°.", 1.0, "°"
     ),

@@ -1,0 +1,120 @@
+"""Colour of surface that several views see agrees where it is aligned to depth, and where it is not, this is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from test_inputs_plain_errors import colour_as
+from test_verdict import CAMERA, poses_of, turned, views_of, whole_run
+
+from modeler import se3
+from modeler.kernels.colour_fit import displaced_correlations
+from modeler.types import RayImage
+from modeler.verdict.colour_fit import Displacement, colour_fit
+
+ANGLES_DEG = [20.0 * k for k in range(8)]
+
+
+def printed(contrast: float = 1.0, *, noise: float = 1.0) -> dict[int, RayImage]:
+    """Return views of an ellipsoid with a print, before a wall with a pattern of its own."""
+    rng, views = np.random.default_rng(5), views_of(ANGLES_DEG)
+    waves, phases = rng.normal(scale=350.0, size=(20, 3)), rng.uniform(0.0, 2.0 * np.pi, 20)
+    wall = 100.0 + 30.0 * ndimage.gaussian_filter(rng.normal(size=(CAMERA.height, CAMERA.width)), 2.0) / 0.14
+    for index, view in views.items():
+        points_m = se3.transform(se3.inverse(turned(ANGLES_DEG[index])), view.points_m)
+        image = wall.copy()
+        image[view.pixels[:, 0], view.pixels[:, 1]] = 120.0 + 12.0 * contrast * np.sum(
+            np.sin(points_m @ waves.T + phases), axis=1
+        )
+        image += noise * rng.normal(size=image.shape)
+        grey = np.clip(image, 0, 255).astype(np.uint8)
+        colour = np.ascontiguousarray(np.broadcast_to(grey[..., None], (*grey.shape, 3)))
+        views[index] = replace(view, frame=replace(view.frame, colour=colour))
+    return views
+
+
+def changed(views: dict[int, RayImage], **how: object) -> dict[int, RayImage]:
+    """Return views with colour as another camera shows it."""
+    given = {"mirrored": False, "scale": 1.0, "shift_px": (0.0, 0.0)} | how
+    found = {}
+    for index, view in views.items():
+        assert view.frame.colour is not None
+        colour = np.ascontiguousarray(colour_as(view.frame.colour, **given))  # pyright: ignore[reportArgumentType]
+        found[index] = replace(view, frame=replace(view.frame, colour=colour))
+    return found
+
+
+def test_aligned_colour_fits() -> None:
+    fit = colour_fit(printed(), poses_of(ANGLES_DEG))
+    assert fit is not None
+    assert fit.correlation > 0.8
+    assert fit.displacement == Displacement()
+    assert fit.check.holds
+
+
+@pytest.mark.parametrize(
+    ("how", "across", "scale", "shift_px"),
+    [
+        ({"mirrored": True}, -1.0, 1.0, (0.0, 0.0)),
+        ({"shift_px": (8.0, 0.0)}, 1.0, 1.0, (8.0, 0.0)),
+        ({"scale": 1.25, "shift_px": (-6.0, 2.0)}, 1.0, 1.25, (-6.0, 2.0)),
+        ({"scale": 0.8}, 1.0, 0.8, (0.0, 0.0)),
+    ],
+)
+def test_displaced_colour_is_found(
+    how: dict[str, object], across: float, scale: float, shift_px: tuple[float, float]
+) -> None:
+    """What is up is hardly observable where all rotation is about the vertical, and the body is symmetric."""
+    fit = colour_fit(changed(printed(), **how), poses_of(ANGLES_DEG))
+    assert fit is not None
+    assert not fit.check.holds
+    assert fit.displacement.flips[0] == across
+    assert fit.displacement.scale == pytest.approx(scale, abs=0.06)
+    assert fit.displacement.shift_px[0] == pytest.approx(shift_px[0], abs=2.0)
+
+
+def test_colour_of_the_frame_before_is_found() -> None:
+    views = printed()
+    late = {
+        k: replace(views[k], frame=replace(views[k].frame, colour=views[max(k - 1, 0)].frame.colour)) for k in views
+    }
+    fit = colour_fit(late, poses_of(ANGLES_DEG))
+    assert fit is not None
+    assert not fit.check.holds
+    assert str(fit.displacement) == "is of the frame before"
+
+
+@pytest.mark.parametrize("noise", [0.0, 8.0])
+def test_a_plain_object_before_a_pattern_contradicts_nothing(noise: float) -> None:
+    fit = colour_fit(printed(0.0, noise=noise), poses_of(ANGLES_DEG))
+    assert fit is not None
+    assert fit.check.holds
+
+
+def test_without_colour_or_shared_surface_nothing_is_said() -> None:
+    assert colour_fit(views_of(ANGLES_DEG), poses_of(ANGLES_DEG)) is None
+    apart = [0.0, 90.0, 180.0]
+    assert colour_fit({k: printed()[k] for k in range(3)}, poses_of(apart)) is None
+
+
+def test_a_run_with_colour_of_another_camera_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = changed(printed(), shift_px=(10.0, 0.0))
+    monkeypatch.setattr("test_verdict.views_of", lambda angles_deg: {k: views[k] for k in range(len(angles_deg))})
+    codes, holds = whole_run(ANGLES_DEG)
+    assert "colour_misaligned" in codes
+    assert holds["colour_fit"] is False
+
+
+def test_correlations_are_those_of_interpolated_values(rng: np.random.Generator) -> None:
+    images = rng.normal(size=(2, 30, 40))
+    places = rng.uniform((8.0, 8.0) * 2, (30.0, 20.0) * 2, (50, 4))
+    shift = Displacement(1.1, (1.5, -0.7), (-1.0, 1.0))
+    found = displaced_correlations(images, np.array([[0, 1]]), np.array([0, 50]), places, shift.row()[None])
+    middle, values = np.array([19.5, 14.5]), []
+    for image, at in zip(images, (places[:, :2], places[:, 2:]), strict=True):
+        column, row = (middle + shift.flips * (shift.scale * (at - middle) + shift.shift_px)).T
+        values.append(ndimage.map_coordinates(image, [row, column], order=1))
+    assert found[0, 0] == pytest.approx(np.corrcoef(*values)[0, 1])
