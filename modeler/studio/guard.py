@@ -19,10 +19,12 @@ MOST_BYTES: Final = 1 << 20
 """Of a request or a message: strokes and choices have a few kilobytes."""
 _POLICY: Final = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; object-src 'none'; base-uri 'self'; "
-    "form-action 'self'; frame-ancestors 'self'; frame-src 'self' http://127.0.0.1:*"
+    "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; object-src 'none'; base-uri 'self'; "
+    "connect-src 'self' data: blob: http://127.0.0.1:*; form-action 'self'; frame-ancestors 'self'; frame-src 'self'"
 )
-"""For browsers: nothing is loaded from elsewhere. The libraries beneath compile their templates in the page."""
+"""For browsers: nothing is loaded from elsewhere, nothing told. Rerun's viewer, which we hand on, asks its makers for
+fonts and news, and reports to them; what a running build sends it takes from a port of its own. The libraries beneath
+compile their templates in the page."""
 _HEADERS: Final = (
     (b"content-security-policy", _POLICY.encode()),
     (b"referrer-policy", b"no-referrer"),

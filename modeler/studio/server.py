@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import secrets
 import shutil
 import socket
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, final
 from urllib.parse import quote
+from urllib.request import urlopen
 
 import nicegui
 import uvicorn
@@ -35,6 +37,9 @@ _POLL_S: Final = 0.25  # between looks at the running command
 _CLOSE_S: Final = 2  # for open connections when the server ends
 _OF_RUN: Final = ("report.html", "recording.rrd")
 _BACKLOG: Final = 128
+_VIEWER_S: Final = 20.0  # for the viewer's largest file, of 40 MB
+_VIEWER_FILE: Final = re.compile(r"[\w.-]{0,64}")
+_ELSEWHERE: Final = re.compile(rb"<link[^>]*https://[^>]*>")
 
 
 @final
@@ -45,10 +50,11 @@ class Viewers:
     server: str
     """Address of our server."""
     token: str
-    """With which the viewer, a page of another port, asks for recordings."""
+    """For the viewer, which asks for recordings without cookies."""
     live: str = ""
     """The command line of the build that it shows."""
     _viewer: Viewer | None = field(default=None, repr=False)
+    _files: dict[str, tuple[bytes, str]] = field(default_factory=dict, repr=False)
 
     def sink(self, line: str) -> str:
         """Return where the build of a command line is to send its recording: to a viewer of its own."""
@@ -58,24 +64,37 @@ class Viewers:
 
     def address(self, scan: Scan) -> str:
         """Return the address of the viewer with the latest run of a scan."""
-        if self._viewer is None or self._viewer.process.poll() is not None:
-            self._viewer, self.live = start_web(), ""
-        if self.live:
-            return f"{self._viewer.address}&renderer=webgl&hide_welcome_screen=1"
-        run = "" if scan.run is None else scan.run.name
-        recording = f"{self.server}/runs/{quote(scan.name)}/{quote(run)}/recording.rrd?token={self.token}"
-        return f"{self.page}?url={quote(recording, safe='')}&renderer=webgl"
+        source = self._started().sink
+        if not self.live:
+            run = "" if scan.run is None else scan.run.name
+            source = f"{self.server}/runs/{quote(scan.name)}/{quote(run)}/recording.rrd?token={self.token}"
+        return f"/viewer/?url={quote(source, safe='')}&renderer=webgl"
 
-    @property
-    def page(self) -> str:
-        """Address of the viewer without a recording."""
-        return "" if self._viewer is None else self._viewer.address.partition("?")[0]
+    def file(self, name: str) -> tuple[bytes, str] | None:
+        """Return one of the files of which the viewer is made, and its kind; None if there is no such file.
+
+        They are handed on under our address, so that our policy holds for them.
+        """
+        if name not in self._files:
+            page = self._started().address.partition("?")[0]
+            try:
+                with urlopen(f"{page}/{name}", timeout=_VIEWER_S) as answer:
+                    content, kind = answer.read(), answer.headers.get_content_type()
+            except OSError:
+                return None
+            self._files[name] = _ELSEWHERE.sub(b"", content) if kind == "text/html" else content, kind
+        return self._files[name]
 
     def stop(self) -> None:
         """End the viewer."""
         if self._viewer is not None:
             self._viewer.stop()
         self._viewer, self.live = None, ""
+
+    def _started(self) -> Viewer:
+        if self._viewer is None or self._viewer.process.poll() is not None:
+            self._viewer, self.live = start_web(), ""
+        return self._viewer
 
 
 def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
@@ -166,8 +185,13 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
         folder = _run(studio, name, run)
         if folder is None or file not in _OF_RUN:
             return Response(status_code=404)
-        headers = {"access-control-allow-origin": viewers.page} if viewers.page and file == "recording.rrd" else {}
-        return _file(folder / file, headers)
+        return _file(folder / file, {})
+
+    @app.get("/viewer/{name}")
+    @app.get("/viewer/")
+    def of_viewer(name: str = "") -> Response:
+        found = viewers.file(name) if _VIEWER_FILE.fullmatch(name) else None
+        return Response(status_code=404) if found is None else Response(found[0], media_type=found[1])
 
     @app.get("/take-away/{name}/{file}")
     def taken(name: str, file: str) -> Response:
