@@ -31,6 +31,7 @@ def untrusted(
     edge = {"accepted": outcome is Outcome.CONVERGED, "kind": "odometry", "source": 1, "target": 0}
     edge |= {"outcome": outcome.label, "target_from_source": turn.ravel().tolist()}
     edge["covariance"] = (np.radians(sigma_deg) ** 2 * np.eye(6)).ravel().tolist()
+    edge["modes"] = [{"weight": 1.0, "weight_in_graph": None}]
     frames = [{"id": 0, "cause": ""}, {"id": 1, "cause": "" if edge["accepted"] else outcome.label}]
     return {"reason_codes": list(codes), "frames": frames, "edges": [edge], "closed": False, **more}
 

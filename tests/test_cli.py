@@ -362,7 +362,10 @@ def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
 def test_a_step_that_the_views_contradict_is_reported() -> None:
     def steps(turn_deg: float, count: int = 4, gap: int = 1) -> list[dict]:
         turn = se3.exp(np.array([0.0, np.radians(turn_deg), 0.0, 0.0, 0.0, 0.0]))
+        modes = [{"weight": 1.0, "weight_in_graph": None}]
+        covariance = np.diag(np.repeat([np.radians(0.5), 1e-3], 3) ** 2).ravel().tolist()
         edge = {"accepted": True, "kind": "odometry", "target_from_source": turn.ravel().tolist()}
+        edge |= {"covariance": covariance, "modes": modes}
         return [edge | {"source": gap * (k + 1), "target": gap * k} for k in range(count)]
 
     prior = priors.TurntablePrior(-30.0, 2.0)
@@ -373,7 +376,20 @@ def test_a_step_that_the_views_contradict_is_reported() -> None:
     assert measured_step(steps(29.0) + again, prior) == ""  # a frame that was tried again lies before its target
     assert "turned by 15.0°" in measured_step(steps(15.0) + again, prior)
     lost = {"accepted": False, "kind": "odometry", "source": 9, "target": 8, "target_from_source": np.eye(4).tolist()}
-    for edges in (steps(25.0), steps(90.0, gap=3), steps(15.0, count=2), [lost] * 5, []):
+    both_senses = steps(50.0, count=2) + steps(-43.0)[2:]
+    unsure = [edge | {"modes": [{"weight": w, "weight_in_graph": w} for w in (0.8, 0.2)]} for edge in steps(15.0)]
+    wide = np.diag(np.repeat([np.radians(8.0), 1e-3], 3) ** 2).ravel().tolist()
+    uncertain = [edge | {"covariance": wide} for edge in steps(15.0)]
+    for edges in (
+        steps(25.0),
+        steps(90.0, gap=3),
+        steps(15.0, count=2),
+        [lost] * 5,
+        [],
+        both_senses,
+        unsure,
+        uncertain,
+    ):
         assert measured_step(edges, prior) == ""
     assert measured_step(steps(15.0), priors.TablePrior()) == ""
     still = measured_step(steps(0.02), prior)

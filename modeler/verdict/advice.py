@@ -10,8 +10,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import AutoPrior, GeneralPrior, TablePrior, TurntablePrior, turntable_in
-from modeler.types import AbstractPrior, Failed, Outcome, Posterior, Reason, advice
-from modeler.verdict.evidence import MAX_UNSURE
+from modeler.types import AbstractPrior, Array, Failed, Outcome, Posterior, Reason, advice
+from modeler.verdict.evidence import MAX_UNSURE, WRONG_SHARE
 
 _SURE_STEPS: Final = 3  # least number of pairs for a measured step
 _FAR_SDS: Final = 3.0  # of the given step, beyond which the measured one contradicts it
@@ -78,11 +78,12 @@ def measured_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> s
         edges: of the report.
         prior: of the run.
     """
-    table, turns = turntable_in(prior), step_angles_deg(edges)
+    table, turns, sigma_deg = turntable_in(prior), *_sure_turns_deg(edges)
     if table is None or len(turns) < _SURE_STEPS:
         return ""
-    found_deg, stated_deg = float(np.median(turns)), abs(table.step_deg)
-    if abs(found_deg - stated_deg) <= _FAR_SDS * table.step_sigma_deg:
+    found_deg, stated_deg = float(np.median(np.linalg.norm(turns, axis=1))), abs(table.step_deg)
+    far_deg = _FAR_SDS * float(np.hypot(table.step_sigma_deg, sigma_deg))
+    if abs(found_deg - stated_deg) <= far_deg or (found_deg > far_deg and not _in_one_sense(turns)):
         return ""
     signed_deg = round(float(np.copysign(found_deg, table.step_deg)), 1)
     return (
@@ -106,6 +107,37 @@ def step_angles_deg(edges: Sequence[Mapping[str, Any]]) -> list[float]:
         for edge, apart in zip(odometry, gaps, strict=True)
         if apart == gap
     ]
+
+
+def _sure_turns_deg(edges: Sequence[Mapping[str, Any]]) -> tuple[Array, float]:
+    """Return the turns from one frame number to the next, of the least gap that occurs, that edges are sure of.
+
+    An edge is sure whose heaviest mode leaves all others the probability at which a pose is called wrong.
+
+    Args:
+        edges: of the report.
+
+    Returns:
+        Rotation vectors (n, 3) in degrees, and the median of their standard deviations.
+    """
+    turns, sigmas_deg = [], []
+    odometry = [edge for edge in edges if edge["accepted"] and edge["kind"] == "odometry"]
+    gap = min((abs(edge["source"] - edge["target"]) for edge in odometry), default=1)
+    for edge in odometry:
+        gaps = edge["source"] - edge["target"]
+        weights = [(mode["weight_in_graph"] or 0.0) for mode in edge["modes"] if mode["weight_in_graph"] is not None]
+        weights = weights or [mode["weight"] for mode in edge["modes"]]
+        if abs(gaps) == gap and max(weights, default=1.0) >= (1.0 - WRONG_SHARE) * sum(weights):
+            turns.append(np.degrees(se3.log(np.reshape(edge["target_from_source"], (4, 4)))[:3]) / gaps)
+            rotation = np.reshape(edge["covariance"], (6, 6))[:3, :3]
+            sigmas_deg.append(float(np.degrees(np.sqrt(np.linalg.eigvalsh(rotation)[-1]))) / gap)
+    return np.reshape(turns, (-1, 3)), float(np.median(sigmas_deg)) if sigmas_deg else 0.0
+
+
+def _in_one_sense(turns: Array) -> bool:
+    """Return whether rotation vectors (n, 3) turn in the same sense about the axis that they share most."""
+    along = turns @ np.linalg.svd(turns)[2][0]
+    return bool((along > 0.0).all() or (along < 0.0).all())
 
 
 def estimated_focal_length(camera: Mapping[str, Any]) -> str:
@@ -268,19 +300,13 @@ def _more_known(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | Non
     if "closures_refused" in report["reason_codes"]:  # the object came back, and the chain of steps missed it
         return _camera(report, prior)
     words, step, sigma = "give the rotation from frame to frame and its standard deviation", "DEG", "DEG"
-    turned_deg = float(np.median(turns)) if turns else 0.0
-    if turns and _sigma_deg(report["edges"]) > max(_ROUGH * turned_deg, 1.0):
+    sure, sigma_deg = _sure_turns_deg(report["edges"])
+    turned_deg = float(np.median(np.linalg.norm(sure, axis=1))) if len(sure) else 0.0
+    if turns and (sigma_deg > max(_ROUGH * turned_deg, 1.0) or len(sure) < 0.5 * len(turns) or not _in_one_sense(sure)):
         words += ", which the images do not determine"
     elif turned_deg >= 1.0:
         step, sigma = f"{turned_deg:.0f}", f"{max(_ROUGH * turned_deg, 1.0):.0f}"
     return Remedy(words, {"prior": "turntable", "step_deg": step, "step_sigma_deg": sigma})
-
-
-def _sigma_deg(edges: Sequence[Mapping[str, Any]]) -> float:
-    """Return the largest standard deviation of a rotation in degrees, median over accepted edges of neighbours."""
-    covariances = [edge["covariance"] for edge in edges if edge["accepted"] and edge["kind"] == "odometry"]
-    rotations = np.reshape(covariances, (-1, 6, 6))[:, :3, :3]
-    return float(np.degrees(np.sqrt(np.median(np.linalg.eigvalsh(rotations)[:, -1]))))
 
 
 def _twice_deg(limit_deg: float) -> str:
