@@ -206,7 +206,7 @@ class RefocusedSequence(AbstractDerived):
         noise = self.whole.sensor()
         if self.focal.told_by != "loop" or self.focal.factor_sigma == 0.0:
             return noise
-        return (SensorNoise() if noise is None else noise)._replace(sigma_focal=self.focal.factor_sigma)
+        return (SensorNoise(sigma_r_m=None) if noise is None else noise)._replace(sigma_focal=self.focal.factor_sigma)
 
     def frame(self, index: int) -> Frame:
         """Return the frame with number `index`.

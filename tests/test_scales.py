@@ -30,9 +30,7 @@ def built() -> dict[float, list[Step]]:
     frames = [sequence.frame(index) for index in sequence.indices[:4]]
     runs = {}
     for scale in (1.0, *SCALES):
-        modeler = Modeler(
-            sensor=Sensor(noise._replace(sigma_r_m=scale * noise.sigma_r_m)), prior=GeneralPrior(limits_assumed=True)
-        )
+        modeler = Modeler(sensor=Sensor(noise._replace(sigma_r_m=None)), prior=GeneralPrior(limits_assumed=True))
         images = [replace(frame, depth_m=np.float32(scale) * frame.depth_m) for frame in frames]
         runs[scale] = [step for step in modeler.run(images, Scene()) if isinstance(step, Step)]
     return runs

@@ -132,8 +132,9 @@ def rows(sequence: AbstractSequence, found: Survey, doubts: Sequence[str]) -> li
         ("colour", f"{found.colours} of {total}"),
         ("ground truth", f"{found.truths} of {total}"),
     ]
-    if sensor is not None:
-        lines.append(("sensor noise", f"{sensor[0]:.3g} across (w, h), {sensor[1] * 1000.0:.3g} mm along the ray"))
+    if sensor is not None and sensor.sigma_r_m is not None:
+        noise = f"{sensor.sigma_wh:.3g} across (w, h), {sensor.sigma_r_m * 1000.0:.3g} mm along the ray"
+        lines.append(("sensor noise", noise))
     if motion is not None:
         lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
     lines += [("doubt", what) for what in doubts]

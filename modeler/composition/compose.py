@@ -65,14 +65,14 @@ _GUESSES = ("velocity", "features")
 def modeler(
     sequence: AbstractSequence, prior_options: PriorOptions, method: MethodOptions, where: ObjectOptions
 ) -> Modeler:
-    """Return the loop with the parts asked for, its sensor as the sequence describes it, else the first Kinect's.
+    """Return the loop with the parts asked for, its sensor as the sequence describes it, else of unknown noise.
 
     Raises:
         InputError: if an option cannot be used.
     """
     check_region(where, sequence)
     noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
-    sensor = Sensor(SensorNoise(sigma_focal=NOMINAL_FOCAL) if noise is None else noise)
+    sensor = Sensor(SensorNoise(sigma_r_m=None, sigma_focal=NOMINAL_FOCAL) if noise is None else noise)
     return Modeler(
         segmenter=segmenter(where),
         sensor=sensor,

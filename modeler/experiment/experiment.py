@@ -176,7 +176,7 @@ class Experiment:
         """Return a function that prepares the view of a frame, or the reason if there is none."""
         noise = recorded.sensor()
         scene = self.segmenter.scene([recorded.frame(index) for index in scene_frames(indices)])
-        sensor = (Sensor() if noise is None else Sensor(noise)).measured(scene.range_noise)
+        sensor = Sensor(SensorNoise(sigma_r_m=None) if noise is None else noise).measured(scene.range_noise)
         return lambda index: self._view(recorded.frame(index), scene, sensor)
 
     def _view(self, frame: Frame, scene: Scene, sensor: Sensor) -> RayImage | Outcome:

@@ -225,18 +225,27 @@ Typical manufacturing tolerance. Focal lengths fitted to boards are good to some
 """
 
 
+_USUAL_NOISE = 0.003
+"""Noise along the ray as a share of the distance, where it is unknown: depth cameras are built for their range. It is
+the first Kinect's 2 mm at 0.7 m, where the captures that this was settled with stand."""
+
+
 class SensorNoise(NamedTuple):
     """Noise of a depth camera in ray coordinates (paper, section II); the defaults are the first Kinect's."""
 
     sigma_wh: float = 0.002
     """Lateral noise in (w, h)."""
-    sigma_r_m: float = 0.002
-    """Noise along the ray in m, for a surface that faces the camera."""
+    sigma_r_m: float | None = 0.002
+    """Noise along the ray in m, for a surface that faces the camera; None = unknown."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
     """Shift of colours beside depth from one image to the next, in px: they are aligned so well at best, and may be
     taken at another moment."""
     sigma_focal: float = 0.0
     """Standard deviation of the logarithm of the focal length; 0 = it is exact."""
+
+    def along_ray_m(self, distance_m: float) -> float:
+        """Return the noise along the ray at a distance, in m."""
+        return _USUAL_NOISE * distance_m if self.sigma_r_m is None else self.sigma_r_m
 
 
 @dataclass(frozen=True, eq=False)

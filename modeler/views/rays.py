@@ -105,7 +105,9 @@ class Sensor:
             )
             surface = outline & (depth_m > 0)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        ball, sigma_inverse_per_m, (sharing, area_px) = self._smoothing(frame, mask, outline)
+        middle_m = float(np.median(frame.depth_m[_places(mask)])) if mask.any() else 0.0
+        sigma_r_m = self.noise.along_ray_m(middle_m)
+        ball, sigma_inverse_per_m, (sharing, area_px) = self._smoothing(frame, mask, outline, sigma_r_m)
         # The object may go on behind what hides it, so its silhouette is known only beyond.
         covered = outline if frame.occluder is None else outline | frame.occluder
         silhouette = planes.silhouette_distance(covered, self.max_silhouette_px)
@@ -129,7 +131,7 @@ class Sensor:
             frame=frame,
             plane=plane,
             sigma_wh=self.noise.sigma_wh,
-            sigma_r_m=self.noise.sigma_r_m,
+            sigma_r_m=sigma_r_m,
             sigma_colour_px=self.noise.sigma_colour_px,
             sigma_focal=self.noise.sigma_focal,
             points_m=points_m,
@@ -143,7 +145,7 @@ class Sensor:
         )
 
     def _smoothing(
-        self, frame: Frame, measured: BoolArray, outline: BoolArray
+        self, frame: Frame, measured: BoolArray, outline: BoolArray, sigma_r_m: float
     ) -> tuple[planes.Ball, float, tuple[float, float]]:
         """Return how an object is smoothed (method, eq. 1.1 and 1.2).
 
@@ -151,6 +153,7 @@ class Sensor:
             frame: with the depth.
             measured: (h, w) its measured pixels.
             outline: (h, w) all its pixels.
+            sigma_r_m: noise along the ray.
 
         Returns:
             The ball; the least standard deviation of inverse depth (1/m); and the number of measured pixels that share
@@ -167,8 +170,8 @@ class Sensor:
         sparse_px = np.sqrt(self.min_neighbours / (np.pi * max(density, 0.01)))
         # method, eq. 1.1; no more noise than stated, as unevenness of planes adds to theirs
         known = math.isfinite(self.pixel_sigma_inverse_per_m)
-        pixel_m = self.pixel_sigma_inverse_per_m * middle_m**2 if known else self.noise.sigma_r_m
-        noise_m = min(pixel_m, self.noise.sigma_r_m)
+        pixel_m = self.pixel_sigma_inverse_per_m * middle_m**2 if known else sigma_r_m
+        noise_m = min(pixel_m, sigma_r_m)
         radius_m = max(self.smoothing * np.sqrt(noise_m * extent_m), sparse_px * metres_per_px)
         reach_px = int(np.clip(np.ceil(radius_m * frame.camera.fx / nearest_m), 2, max(16, np.ceil(1.2 * sparse_px))))
         # A stride of 2 px is enough where a wide window holds many pixels.
@@ -178,7 +181,7 @@ class Sensor:
         ball_px = np.pi * (radius_m / metres_per_px) ** 2
         sharing = max(density * (ball_px + _ALIKE * self.noise_area_px), 1.0)
         # A tenth of the sensor's noise: neighbouring pixels err alike, so that residuals understate it.
-        return ball, 0.1 * self.noise.sigma_r_m / middle_m**2, (float(sharing), float(ball_px + self.noise_area_px))
+        return ball, 0.1 * sigma_r_m / middle_m**2, (float(sharing), float(ball_px + self.noise_area_px))
 
 
 def rim_weights(outline: BoolArray) -> np.ndarray:

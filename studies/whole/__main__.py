@@ -22,7 +22,7 @@ import numba
 
 from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
-from studies.whole.plan import HALVES, Half, Plan
+from studies.whole.plan import HALVES, Plan
 from studies.whole.study import Outcome, outcome
 from studies.whole.tables import counts, text
 
@@ -41,12 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", type=int, nargs="+", metavar="NUMBER", help="only these captures")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/whole"), help="folder of the results")
-    parser.add_argument("--record", action="store_true", help="put the counts of the half into the results")
+    parser.add_argument("--record", action="store_true", help="put the counts by factor into the results")
     options = parser.parse_args(arguments)
     if options.captures < 1 or options.jobs < 1:
         parser.error("--captures and --jobs take whole numbers from 1 on")
-    if options.record and (options.captures != CAPTURES or options.only):
-        parser.error(f"the results are of all {CAPTURES} captures of a half")
+    if options.record and (options.half != "held-out" or options.captures != CAPTURES or options.only):
+        parser.error(f"the results are of all {CAPTURES} captures of the held-out half")
     options.out.mkdir(parents=True, exist_ok=True)
     plans = [
         Plan(options.half, number)
@@ -71,8 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     outcomes = [done[plan.number] for plan in plans]
     print(text(outcomes))
     if options.record:
-        half: Half = options.half
-        record(FOLDER / "whole.json", [(f"{half} half, {name}", *row) for name, *row in counts(outcomes)])
+        record(FOLDER / "whole.json", counts(outcomes))
     return 0
 
 

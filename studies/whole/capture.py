@@ -61,7 +61,7 @@ class Capture(AbstractSequence):
 
     def sensor(self) -> SensorNoise | None:
         """Return what a device says of its focal length; None if nothing is said."""
-        return SensorNoise()._replace(sigma_focal=_DEVICE) if self.factors.intrinsics == "device" else None
+        return SensorNoise(sigma_r_m=None, sigma_focal=_DEVICE) if self.factors.intrinsics == "device" else None
 
     def truth(self) -> dict[int, Array]:
         """Return the true camera_from_model (4, 4) by frame number."""
