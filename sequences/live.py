@@ -28,6 +28,10 @@ MAX_REPEATS = 100
 """Largest number of repetitions of one image."""
 
 
+Image = tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]
+"""Time in s, raw depth (h, w), and colour (h, w, 3) of the depth camera's pixels, if there is any."""
+
+
 class AbstractCamera(ABC):
     """A camera that is running."""
 
@@ -47,8 +51,8 @@ class AbstractCamera(ABC):
         """Millimetres per unit of depth."""
 
     @abstractmethod
-    def take(self) -> tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]:
-        """Return time in s, raw depth (h, w), and colour (h, w, 3) of the depth camera's pixels, of the newest image.
+    def take(self) -> Image:
+        """Return the newest image.
 
         Raises:
             InputError: if the camera gives none.
@@ -264,7 +268,7 @@ class RealsenseCamera(AbstractCamera):
         """Millimetres per unit of depth."""
         return self.scale_mm
 
-    def take(self) -> tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]:
+    def take(self) -> Image:
         """Return the newest image; older ones are dropped."""
         try:
             frames = self.align.process(self.pipeline.wait_for_frames(TIMEOUT_MS))

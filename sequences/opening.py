@@ -21,6 +21,7 @@ from modeler.sequences.image_folders import (
 from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import SCHEME, open_camera
+from modeler.sequences.makers import LIBRARIES, open_camera_of
 from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.ray_distance import AxialSequence
 from modeler.sequences.tum import open_tum
@@ -29,7 +30,7 @@ from modeler.types import InputError
 
 FORMATS = (
     "a folder with depth/ (BOP, TUM RGB-D, Open3D, BundleSDF, your own), organised clouds, a ROS bag, a RealSense "
-    "recording, an Azure Kinect .mkv, or realsense:"
+    "recording, an Azure Kinect .mkv, or realsense:, orbbec:, oak: or azure: for a camera"
 )
 BAGS = (".bag", ".mcap", ".db3")
 
@@ -38,7 +39,7 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
     """Open the sequence at a path in whichever supported format.
 
     Args:
-        path: a folder or a file, or `realsense:` for a live camera.
+        path: a folder or a file, or `realsense:`, `orbbec:`, `oak:` or `azure:` for a live camera.
         overrides: values that take precedence over the files.
 
     Raises:
@@ -49,6 +50,9 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
         raise InputError(f"{path}: its name is not UTF-8; rename it.")
     if str(path).startswith(SCHEME):
         return open_camera(str(path).removeprefix(SCHEME), overrides)
+    maker, colon, serial = str(path).partition(":")
+    if colon and maker in LIBRARIES and not path.exists():
+        return open_camera_of(maker, serial, overrides)
     try:
         found = with_hand(_open(path, overrides))
         return AxialSequence(found) if overrides.along_ray else found

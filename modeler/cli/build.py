@@ -40,7 +40,7 @@ class Build:
 
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
     """Folder of images (BOP, TUM RGB-D, Open3D, BundleSDF, your own) or of organised clouds (PCD, PLY).
-    ROS bag, MCAP, RealSense or Azure Kinect recording; realsense: for a connected camera."""
+    ROS bag, MCAP, RealSense or Azure Kinect recording; realsense:, orbbec:, oak: or azure: for a connected one."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """Run folder to create: model.ply, cloud.ply, trajectory.txt, graph.g2o, report.json, recording.rrd and more."""
     overwrite: bool = False

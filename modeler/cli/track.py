@@ -34,7 +34,7 @@ class Track:
     model: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL")]
     """Run folder of `modeler build`, or a mesh: PLY, OBJ, GLB or STL."""
     sequence: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SEQUENCE")]
-    """A sequence in any format that `modeler build` takes; realsense: for a connected camera."""
+    """A sequence in any format that `modeler build` takes; realsense: and others for a connected camera."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder to create: poses.json, trajectory.txt, bop.csv, recording.rrd and report.html."""
     unit: Annotated[Literal["m", "cm", "mm"] | None, default("m; mm beside a models_info.json")] = None
