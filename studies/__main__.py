@@ -22,6 +22,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "bench.multiway": ("make a whole model by Open3D's recipes", "seconds"),
     "calibration": ("calibration of covariances on rendered pairs", "half an hour"),
     "calibration.by_camera": ("the same for cameras other than the renderer's", "20 minutes"),
+    "colour": ("what colour tells: aligned, displaced, faint and natural", "half an hour a core"),
     "far_apart": ("registration of views that are far apart", "3 minutes"),
     "far_apart.few_frames": ("whole models from four or six views", "minutes"),
     "fuzz": ("damaged inputs of every format: read, or refused in one line", "hours"),
