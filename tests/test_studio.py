@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import random
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,13 @@ from command_runner import Run
 from studio_server import Server, served
 
 from modeler.cli import parsed
-from modeler.sequences import open_sequence
+from modeler.sequences import open_sequence, write_bop
 from modeler.studio.guard import MOST_BYTES, Guard
 from modeler.studio.jobs import Job, Queue
 from modeler.studio.pictures import outline_svg, thumbnail
 from modeler.studio.scan import Scan, Studio, drawn
 from modeler.types import BoolArray, InputError
+from studies.formats.image_folders import small_frames
 
 PORT = 8080
 
@@ -211,6 +213,47 @@ def test_pictures_show_the_mask(scan: Scan) -> None:
     assert outline_svg(None) == ""
     assert outline_svg(mask).count("<path") == 2
     assert thumbnail(scan.sequence.frame(0), mask) != thumbnail(scan.sequence.frame(0), None)
+
+
+@pytest.mark.slow
+def test_a_folder_that_is_being_written_is_followed_and_built_though_it_stalls(tmp_path: Path) -> None:
+    whole, folder = tmp_path / "whole", tmp_path / "growing"
+    write_bop(whole, small_frames(4), depth_scale_mm=1.0)
+    frames = sorted(path.stem for path in (whole / "depth").iterdir())
+    studio = Studio(tmp_path / "studio")
+    studio.queue.add(studio.watch(folder, "table", None))
+    capture = studio.capture
+    assert capture is not None
+    assert capture.job.line.startswith(f"modeler build {folder} --watch")
+    assert (capture.count, capture.said(), capture.facts()) == (0, (None, ""), [])
+    for number, name in enumerate(frames):
+        for kind in ("depth", "rgb", "mask_visib"):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            for path in (whole / kind).glob(f"{name}*"):
+                shutil.copy(path, folder / kind)
+        if not number:
+            shutil.copy(whole / "scene_camera.json", folder)
+        wait(lambda number=number: capture.count > number)
+        time.sleep(2.0 * (number == 2))  # it stalls
+    (folder / "done").touch()
+    finish(studio.queue)
+    assert "away" in capture.facts()[0]
+    assert capture.facts()[1].startswith("exposure: ")
+    assert capture.doubts() == []
+    assert capture.said()[0] is True
+    capture.stop()
+    scan = studio.open(folder)
+    report = scan.report()
+    assert report is not None
+    assert len(report["poses"]) == 4
+    assert report["prior"] == "table"
+
+
+def wait(until: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60.0
+    while not until():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 # The guard

@@ -270,6 +270,7 @@ class Console:
         if found.reached and not self._enough:
             self._enough = True
             self._say(found.summary)
+        self._say(summary_of(found), logging.DEBUG)
         if self._state and not self._stage:
             self._bar.update(self._task, description=f"{self._state}; {summary_of(found)}")
 

@@ -14,6 +14,7 @@ from nicegui import events, run, ui
 from modeler.export import RunFolder
 from modeler.sequences.clouds import SUFFIXES
 from modeler.sequences.opening import BAGS
+from modeler.studio.capture import Capture
 from modeler.studio.jobs import Job
 from modeler.studio.pictures import box_svg, outline_svg, stroke_svg
 from modeler.studio.scan import MESHES, Choices, Scan, Studio
@@ -22,8 +23,17 @@ from modeler.types import ACCEPTED, InputError
 if TYPE_CHECKING:
     from modeler.studio.server import Viewers
 
-STEPS: Final = ("Files", "Object", "Build", "Check", "Take away", "Scans")
+STEPS: Final = ("Files", "Capture", "Object", "Build", "Check", "Take away", "Scans")
 _POLL_S: Final = 0.3
+_LATE_S: Final = 15.0  # without a frame: longer than a person takes to turn an object by hand
+_TONE: Final = """<script>
+window.tone = (hertz) => {
+  window.sound = window.sound || new AudioContext();
+  const tone = sound.createOscillator(), quiet = sound.createGain();
+  tone.frequency.value = hertz; quiet.gain.value = 0.1;
+  tone.connect(quiet).connect(sound.destination); tone.start(); tone.stop(sound.currentTime + 0.12);
+};
+</script>"""
 _DRAW_S: Final = 0.05  # between redrawings of a stroke, so that the connection keeps up
 _CLICK_PX: Final = 4.0  # a pointer that moves less has been clicked
 _RECORDINGS: Final = (*BAGS, *SUFFIXES, ".mkv", ".r3d")
@@ -92,6 +102,7 @@ class Page:
     def show(self) -> None:
         """Build the page."""
         ui.add_css(_STYLE.read_text())
+        ui.add_head_html(_TONE)
         ui.colors(primary="#0b6b75")
         with ui.header().classes("items-center no-wrap").style("background: #10343b; padding: 0 12px"):
             self.title = ui.label("modeler studio").classes("title text-subtitle1 q-mr-md")
@@ -118,6 +129,7 @@ class Page:
         self._shown_iframe = ""
         self._seen = (self.studio.version, -1 if scan is None else scan.version)
         self._files()
+        self._capture()
         self._scans()
         if scan is not None:
             self.title.text = scan.name
@@ -136,7 +148,7 @@ class Page:
 
     def go(self, step: str) -> None:
         """Show a step."""
-        if step not in STEPS or (self.scan is None and step not in ("Files", "Scans")):
+        if step not in STEPS or (self.scan is None and step not in ("Files", "Capture", "Scans")):
             if step in STEPS:
                 ui.notify("Open a capture first.")
             step = "Files"
@@ -189,6 +201,90 @@ class Page:
                 _complain(error)
             return
         self._start()
+
+    # Capture
+
+    def _capture(self) -> None:
+        panel = self.panels["Capture"]
+        panel.clear()
+        self._watched = ""
+        with panel:
+            with ui.element("div").classes("wide"):
+                self.live = ui.interactive_image().classes("photo").props("role=img aria-label='The newest frame'")
+                self.live_viewer = ui.element("div").classes("w-full q-mt-sm")
+            with ui.element("div").classes("side first column gap-3"):
+                with ui.element("div").classes("card"):
+                    ui.label("Take a capture").classes("text-h6")
+                    ui.label(
+                        "Have a camera program write depth images into a folder, turn the object a little between two "
+                        "frames, and watch the model grow."
+                    ).classes("quiet")
+                    folder = ui.input("Folder", value=str(self.place)).classes("w-full").props("dense outlined")
+                    moves = {name: label for name, (label, *_) in _PRIORS.items() if name != "held"}
+                    prior = ui.select(moves, value="auto", label="How does it move?").classes("w-full").props("dense")
+                    with ui.row().classes("no-wrap items-center"):
+                        step = ui.number("Step, degrees", value=20, step=1).props("dense")
+                        pause = ui.number("every, seconds", value=5, min=1, step=1).props("dense")
+                    step.bind_visibility_from(prior, "value", value="turntable")
+                    ticks = ui.switch(
+                        "Metronome", on_change=lambda event: self._tick(bool(event.value), pause.value or 5.0)
+                    )
+                    ticks.props("aria-label='Metronome: a tick for each step'")
+                    pause.on_value_change(lambda: self._tick(bool(ticks.value), pause.value or 5.0))
+                    ui.button(
+                        "Watch the folder",
+                        on_click=lambda: self._watch(
+                            Path(folder.value or "."),
+                            None if prior.value == "auto" else prior.value,
+                            step.value if prior.value == "turntable" else None,
+                        ),
+                    ).props("no-caps").classes("w-full q-mt-sm")
+                with ui.element("div").classes("card") as self.light:
+                    self.come = ui.label("Nothing is watched.").classes("text-h6").props("role=status")
+                    self.come_more = ui.label().classes("quiet").style("white-space: pre-line")
+                self.capture_line = _line()
+
+    async def _watch(self, folder: Path, prior: str | None, step_deg: float | None) -> None:
+        """Follow a folder that is being written."""
+        if self.studio.queue.current is not None:
+            ui.notify("Something is running; stop it first, or wait.")
+            return
+        try:
+            jobs = await run.io_bound(self.studio.watch, folder.expanduser(), prior, step_deg) or []
+            await run.io_bound(self._show_live, jobs)
+        except InputError as error:
+            _complain(error)
+            return
+        self._run(jobs)
+
+    def _tick(self, on: bool, pause_s: float) -> None:
+        """Tick for each step of a turntable, or stop ticking."""
+        beat = f"window.beat = setInterval(() => tone(880), {1000.0 * max(pause_s, 0.5):.0f})" if on else ""
+        ui.run_javascript(f"clearInterval(window.beat); {beat}")
+
+    def _follow(self) -> None:
+        """Show what has come into the folder."""
+        capture = self.studio.capture
+        if capture is None or self.step != "Capture":
+            return
+        placed, words = capture.said()
+        told = f"{capture.count} {words} {capture.next()}"
+        self.come.text = _come(capture, placed, words)
+        self.capture_line.text = capture.job.line
+        lines = [*capture.doubts(), *capture.facts(), capture.next()]
+        self.come_more.text = "\n".join(f"{line[:1].upper()}{line[1:]}." for line in lines if line)
+        if told == self._watched:
+            return
+        self._watched = told
+        self.light.classes(replace=f"card {'' if placed is None else 'good' if placed else 'bad'}")
+        if capture.count:
+            self.live.set_source(f"/capture/newest.jpg?v={capture.count}")
+            self.live.set_content(outline_svg(capture.mask))
+        if placed is not None:
+            ui.run_javascript(f"tone({660 if placed else 220})")
+        if self.viewers.live == capture.job.line and not list(self.live_viewer):
+            with self.live_viewer:
+                _viewer(self.viewers.address(None))
 
     # Object
 
@@ -420,9 +516,7 @@ class Page:
         address = self.viewers.address(scan)
         self.viewer.clear()
         with self.viewer:
-            frame = ui.element("iframe").props("title='The model in the Rerun viewer' allow=fullscreen")
-            frame.props["src"] = address
-            frame.style("height: calc(100vh - 130px); min-height: 380px")
+            _viewer(address)
 
     def stop(self) -> None:
         """Stop what runs; of a build, what is there is kept."""
@@ -632,6 +726,7 @@ class Page:
             self._seen = (self.studio.version, scan.version)
             self._outline(scan)
             self._mark_prior(scan)
+        self._follow()
         job = queue.current
         self.footer.set_visibility(job is not None)
         if job is not None:
@@ -643,9 +738,13 @@ class Page:
             self.bar.update()
         if job is not self._job and job is not None and scan is not None and job.words[0] == "build":
             self._embed()
-        if queue.last is not self._ended and scan is not None:
+        if queue.last is not self._ended:
             self._ended = queue.last
-            self._after(scan, queue.last)
+            capture = self.studio.capture
+            if capture is not None and not capture.job.running and job is None:
+                self._captured(capture)
+            elif scan is not None:
+                self._after(scan, queue.last)
         self._job = job
 
     def _after(self, scan: Scan, job: Job | None) -> None:
@@ -660,6 +759,18 @@ class Page:
         self._embed_if_shown()
         if job.words[0] == "report" and self.step == "Build" and job.failure is None:
             self.go("Check")
+
+    def _captured(self, capture: Capture) -> None:
+        """Go on with a capture whose model has been made."""
+        capture.stop()
+        self.studio.capture = None
+        if capture.job.failure is not None:
+            ui.notify(capture.job.failure, type="negative", timeout=0, close_button="OK", multi_line=True)
+            return
+        try:
+            self.studio.open(capture.folder)
+        except InputError as error:
+            _complain(error)
 
     def _embed_if_shown(self) -> None:
         if self.step == "Build":
@@ -682,6 +793,27 @@ class Page:
                 self._turn_to(frames[max(at - 1, 0)])
         if name == "b" and scan is not None and self.step == "Build":
             await self.build()
+
+
+def _viewer(address: str) -> None:
+    """Embed the viewer."""
+    frame = ui.element("iframe").props("title='The model in the Rerun viewer' allow=fullscreen")
+    frame.props["src"] = address
+    frame.style("height: calc(100vh - 130px); min-height: 380px")
+
+
+def _come(capture: Capture, placed: bool | None, words: str) -> str:
+    """Return in words whether the next view may come."""
+    if not capture.job.running:
+        return capture.job.failure or "The capture has ended."
+    if placed is None:
+        return (
+            f"{capture.count} frames; the model begins with the first few." if capture.count else "Waiting for frames."
+        )
+    if placed:
+        late = f" No new one for {capture.waits_s:.0f} s." if capture.waits_s > _LATE_S else ""
+        return f"{words}. Turn it: the next view may come.{late}"
+    return f"{words}. Turn it back a little, and try again."
 
 
 def _entries(folder: Path) -> list[Path]:

@@ -24,6 +24,7 @@ from modeler.composition.options import PriorOptions
 from modeler.export import FORMATS, RunFolder, write_atomically
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import AbstractSequence, KeptSequence, finest_unit_mm, open_sequence, scene_meta, write_bop
+from modeler.studio.capture import IDLE_S, Capture
 from modeler.studio.jobs import Job, Queue
 from modeler.system.regular_files import read_regular
 from modeler.types import BoolArray, InputError, Outcome, Segmentation
@@ -74,6 +75,24 @@ class Choices:
             return cls(**given)
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise InputError(f"{path}: is no scan of modeler studio ({error}); remove it") from error
+
+    def write(self, path: Path) -> None:
+        """Keep them, for a server after this one."""
+        write_atomically(path, json.dumps(asdict(self), indent=1) + "\n")
+
+    def options(self, *, within: bool = True) -> list[str]:
+        """Return them as options of the build.
+
+        Args:
+            within: whether to name the region.
+        """
+        words = [] if self.prior is None else ["--prior", self.prior]
+        if self.prior == "turntable" and self.step_deg is not None:
+            words += ["--step-deg", f"{self.step_deg:g}"]
+            words += [] if self.step_sigma_deg is None else ["--step-sigma-deg", f"{self.step_sigma_deg:g}"]
+        if self.roi is not None and within:
+            words += ["--roi", *map(str, self.roi)]
+        return words + ([] if self.camera is None else ["--camera", self.camera])
 
 
 @final
@@ -214,8 +233,7 @@ class Scan:
 
     def runs(self) -> list[Path]:
         """Return the runs of `build`, from the first."""
-        found = ((match, path) for path in self.folder.glob("run-*") if (match := _RUN.fullmatch(path.name)))
-        return [path for _, path in sorted(found, key=lambda one: int(one[0][1]))]
+        return runs_in(self.folder)
 
     @property
     def run(self) -> Path | None:
@@ -240,29 +258,21 @@ class Scan:
         Raises:
             InputError: if the masks cannot be written.
         """
-        run = self.runs()[-1] if resume else self._next()
+        run = self.runs()[-1] if resume else next_run(self.folder)
         words = ["build", str(self._source()), "--out", str(run), *self.options(), *(["--resume"] if resume else [])]
         if not resume:
             self._choose(dropped=())
         title, frames = "Building the model", len(self.sequence.indices)
-        return [Job(tuple(words), self.folder / f"{run.name}.log", title, frames=frames), self._page_job(run)]
+        return [Job(tuple(words), self.folder / f"{run.name}.log", title, frames=frames), page_job(run)]
 
     def options(self) -> list[str]:
-        """Return the options of the build."""
-        chosen, words = self.choices, list[str]()
-        if chosen.prior is not None:
-            words += ["--prior", chosen.prior]
-        if chosen.prior == "turntable" and chosen.step_deg is not None:
-            words += ["--step-deg", f"{chosen.step_deg:g}"]
-            words += [] if chosen.step_sigma_deg is None else ["--step-sigma-deg", f"{chosen.step_sigma_deg:g}"]
-        if chosen.roi is not None and not self.painted:
-            words += ["--roi", *map(str, chosen.roi)]
-        return words + ([] if chosen.camera is None else ["--camera", chosen.camera])
+        """Return the options of the build; masks painted by hand were found within the box."""
+        return self.choices.options(within=not self.painted)
 
     def line(self) -> str:
         """Return the command line of the next build."""
         source = self.folder / (self.choices.masked or "masked-1") if self.painted else self.choices.sequence
-        return shlex.join(("modeler", "build", str(source), "--out", str(self._next()), *self.options()))
+        return shlex.join(("modeler", "build", str(source), "--out", str(next_run(self.folder)), *self.options()))
 
     def edit_jobs(self, dropped: Sequence[int]) -> list[Job]:
         """Return the re-optimisation of the latest run without frames; nothing where all are back: it is as it was.
@@ -276,7 +286,7 @@ class Scan:
             return []
         out = self._edited(run)
         words = ("edit", str(run), "--drop", ",".join(map(str, sorted(dropped))), "--out", str(out), "--overwrite")
-        return [Job(words, self.folder / f"{out.name}.log", "Optimising again"), self._page_job(out)]
+        return [Job(words, self.folder / f"{out.name}.log", "Optimising again"), page_job(out)]
 
     def calibrate_job(self, known: str | None = None) -> Job:
         """Return the estimation of the focal length from the latest run, for the next build.
@@ -349,16 +359,6 @@ class Scan:
         return compose.prior_name(PriorOptions(), self.sequence)
 
     # Beneath
-
-    def _next(self) -> Path:
-        """Return the folder of the next run."""
-        numbers = [int(match[1]) for path in self.runs() if (match := _RUN.fullmatch(path.name))]
-        return self.folder / f"run-{max(numbers, default=0) + 1}"
-
-    def _page_job(self, run: Path) -> Job:
-        """Return the writing of the page about a run."""
-        words = ("report", str(run), "--overwrite")
-        return Job(words, self.folder / f"{run.name}-report.log", "Drawing the pictures")
 
     def _some_run(self) -> Path:
         run = self.run
@@ -439,11 +439,28 @@ class Scan:
         with self._lock:
             self.choices = replace(self.choices, **changes)
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(self.folder / STATE, json.dumps(asdict(self.choices), indent=1) + "\n")
+            self.choices.write(self.folder / STATE)
             self._changed()
 
     def _changed(self) -> None:
         self.version += 1
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """Return the runs of `build` in the folder of a scan, from the first."""
+    found = ((match, path) for path in folder.glob("run-*") if (match := _RUN.fullmatch(path.name)))
+    return [path for _, path in sorted(found, key=lambda one: int(one[0][1]))]
+
+
+def next_run(folder: Path) -> Path:
+    """Return the folder of the next run of a scan."""
+    numbers = [int(match[1]) for path in runs_in(folder) if (match := _RUN.fullmatch(path.name))]
+    return folder / f"run-{max(numbers, default=0) + 1}"
+
+
+def page_job(run: Path) -> Job:
+    """Return the writing of the page about a run."""
+    return Job(("report", str(run), "--overwrite"), run.with_name(f"{run.name}-report.log"), "Drawing the pictures")
 
 
 def drawn(shape: tuple[int, ...], points: Sequence[tuple[float, float]], radius_px: float) -> BoolArray:
@@ -478,6 +495,8 @@ class Studio:
         self.queue = Queue(out / "jobs.json")
         self.current: Scan | None = None
         """The scan that pages show."""
+        self.capture: Capture | None = None
+        """The folder that is being written."""
         self.version = 0
         """Grows where pages must be drawn anew."""
         self._scans: dict[Path, Scan] = {}
@@ -488,18 +507,46 @@ class Studio:
         Raises:
             InputError: if it is no capture.
         """
-        place = str(sequence.absolute())
-        kept = {folder: Choices.read(folder / STATE) for folder in self.folders()}
-        folder = next((folder for folder, one in kept.items() if one.sequence == place), None)
-        if folder is None:
-            stem = re.sub(r"[^\w.-]+", "-", sequence.absolute().name).strip(".-") or "scan"
-            names = (stem if number == 1 else f"{stem}-{number}" for number in range(1, 10_000))
-            folder = next(self.out / name for name in names if not (self.out / name).exists())
+        folder, choices = self._chosen(sequence)
         if folder not in self._scans:
-            scan = self._scans[folder] = Scan(folder, kept.get(folder, Choices(place)), self.queue)
+            scan = self._scans[folder] = Scan(folder, choices, self.queue)
             scan._choose()
         self.show(self._scans[folder])
         return self._scans[folder]
+
+    def watch(self, folder: Path, prior: str | None, step_deg: float | None) -> list[Job]:
+        """Build from a folder that a camera program writes, frame by frame, and show what comes.
+
+        Args:
+            folder: where it writes; it need not be there yet.
+            prior: name of the motion prior; None: auto.
+            step_deg: turn from frame to frame (turntable).
+        """
+        place, choices = self._chosen(folder)
+        choices = replace(choices, prior=prior, step_deg=step_deg, dropped=())
+        place.mkdir(parents=True, exist_ok=True)
+        choices.write(place / STATE)
+        run = next_run(place)
+        words = ("build", choices.sequence, "--watch", "--idle-s", f"{IDLE_S:g}", "--out", str(run), *choices.options())
+        job = Job(words, place / f"{run.name}.log", "Building the model as frames come")
+        if self.capture is not None:
+            self.capture.stop()
+        self.capture = Capture(folder, job)
+        return [job, page_job(run)]
+
+    def _chosen(self, sequence: Path) -> tuple[Path, Choices]:
+        """Return the folder and the choices of the scan of a capture, or those of a new one.
+
+        Raises:
+            InputError: if a file of choices is none of ours.
+        """
+        place = str(sequence.absolute())
+        for folder in self.folders():
+            if (kept := Choices.read(folder / STATE)).sequence == place:
+                return folder, kept
+        stem = re.sub(r"[^\w.-]+", "-", sequence.absolute().name).strip(".-") or "scan"
+        names = (stem if number == 1 else f"{stem}-{number}" for number in range(1, 10_000))
+        return next(self.out / name for name in names if not (self.out / name).exists()), Choices(place)
 
     def show(self, scan: Scan) -> None:
         """Have all pages show a scan."""

@@ -62,10 +62,10 @@ class Viewers:
         self._viewer, self.live = start_web(), line
         return self._viewer.sink
 
-    def address(self, scan: Scan) -> str:
-        """Return the address of the viewer with the latest run of a scan."""
+    def address(self, scan: Scan | None) -> str:
+        """Return the address of the viewer with the build that runs, else with the latest run of a scan."""
         source = self._started().sink
-        if not self.live:
+        if not self.live and scan is not None:
             run = "" if scan.run is None else scan.run.name
             source = f"{self.server}/runs/{quote(scan.name)}/{quote(run)}/recording.rrd?token={self.token}"
         return f"/viewer/?url={quote(source, safe='')}&renderer=webgl"
@@ -130,6 +130,8 @@ def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
         uvicorn.Server(config).run(sockets=[listening])
     finally:
         studio.queue.stop()
+        if studio.capture is not None:
+            studio.capture.stop()
         viewers.stop()
 
 
@@ -167,6 +169,11 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
         if scan is None or frame not in scan.sequence.indices:
             return Response(status_code=404)
         return _picture(thumbnail(scan.sequence.frame(frame), scan.mask(frame)))
+
+    @app.get("/capture/newest.jpg")
+    def newest() -> Response:
+        frame = None if studio.capture is None else studio.capture.frame
+        return Response(status_code=404) if frame is None else _picture(jpeg(frame))
 
     @app.get("/models/{name}/{run}.jpg")
     def of_model(name: str, run: str) -> Response:

@@ -1,0 +1,117 @@
+"""A capture that is being taken: the newest frame in a folder that a camera writes, and what is wrong with it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Final, final
+
+import numpy as np
+
+from modeler.segmentation import Scene, Segmenter
+from modeler.sequences import Overrides, WatchLimits
+from modeler.sequences.base import FIRST
+from modeler.sequences.watch import arriving
+from modeler.studio.jobs import Job
+from modeler.types import BoolArray, Frame, InputError, Outcome, Segmentation
+
+IDLE_S: Final = 600.0
+"""A person who turns an object by hand, and is called away, takes so long at most."""
+_LEARNT_FROM: Final = 12  # frames; the segmenter asks for about a dozen
+_END_PX: Final = (5, 250)  # colours beyond are black or saturated, whatever was there
+
+
+@final
+class Capture:
+    """Follows a folder from a thread of its own until the build that reads it ends."""
+
+    def __init__(self, folder: Path, job: Job) -> None:
+        """Begin to follow a folder, which need not be there yet, and the build that watches it."""
+        self.folder, self.job = folder, job
+        self.frame: Frame | None = None
+        """The newest frame."""
+        self.found: Segmentation | None = None
+        """The object in it; None before the scene is learned."""
+        self.count = 0
+        """Number of frames so far."""
+        self.fault = ""
+        """Why nothing can be read."""
+        self._came_s = time.monotonic()
+        self._scene = Scene()
+        self._stopped = threading.Event()
+        threading.Thread(target=self._follow, daemon=True, name="capture").start()
+
+    def stop(self) -> None:
+        """Follow the folder no longer."""
+        self._stopped.set()
+
+    @property
+    def mask(self) -> BoolArray | None:
+        """The object (h, w) in the newest frame."""
+        return None if self.found is None else self.found.mask
+
+    @property
+    def waits_s(self) -> float:
+        """For how long no frame has come."""
+        return time.monotonic() - self._came_s
+
+    def facts(self) -> list[str]:
+        """Return distance, size and exposure of the object in the newest frame, in words."""
+        frame, mask = self.frame, self.mask
+        if frame is None or mask is None or not mask.any():
+            return []
+        depth_m = frame.depth_m[mask]
+        measured = depth_m > 0.0
+        if not measured.any():
+            return ["nothing is measured on the object"]
+        rows, columns = np.nonzero(mask)
+        words = [
+            f"{float(np.median(depth_m[measured])):.2f} m away, {np.ptp(columns) + 1} x {np.ptp(rows) + 1} pixels, "
+            f"{100.0 * measured.mean():.0f} % of them measured"
+        ]
+        if frame.colour is not None:
+            light = frame.colour[mask].max(axis=1)
+            dark, bright = (
+                100.0 * float(share) for share in ((light < _END_PX[0]).mean(), (light > _END_PX[1]).mean())
+            )
+            words.append(f"exposure: {dark:.0f} % of it black, {bright:.0f} % saturated")
+        return words
+
+    def doubts(self) -> list[str]:
+        """Return what looks wrong, in words."""
+        found = []
+        if self.found is not None and self.found.outcome is not Outcome.CONVERGED:
+            found.append(f"{self.found.outcome.label}: {self.found.outcome.advice}".replace("`", ""))
+        if self._scene.camera_moves:
+            found.append("the camera seems to move; keep it still")
+        if self._scene.arms:
+            found.append("an arm is in view; take it out of the image before each frame")
+        return [*found, *([self.fault] if self.fault else [])]
+
+    def said(self) -> tuple[bool | None, str]:
+        """Return whether the build has placed the newest frame, None where it has not said yet, and its words."""
+        placed, words = None, ""
+        for _, _, line in self.job.messages():
+            if line.startswith("frame "):
+                placed, words = "left out" not in line, line.partition(";")[0]
+        return placed, words
+
+    def next(self) -> str:
+        """Return what the build suggests to do next; "" before."""
+        suggested = [line for _, _, line in self.job.messages() if line.startswith(("next: ", "nothing more"))]
+        return suggested[-1] if suggested else ""
+
+    def _follow(self) -> None:
+        """Take the frames as they come."""
+        kept: list[Frame] = []
+        try:
+            for frame in arriving(self.folder, Overrides(), WatchLimits(IDLE_S), self._stopped.is_set):
+                kept = [*kept, frame][-_LEARNT_FROM:]
+                self.count += 1
+                if self.count >= FIRST and self.count <= _LEARNT_FROM:
+                    self._scene = Segmenter().scene(kept)
+                self.found = Segmenter().segment(frame, self._scene) if self.count >= FIRST else None
+                self.frame, self._came_s = frame, time.monotonic()
+        except InputError as error:
+            self.fault = str(error).replace("`", "")
