@@ -17,13 +17,14 @@ import pytest
 pytest.importorskip("nicegui", reason="needs the extra studio")
 
 from command_runner import Run
+from scipy.spatial.transform import Rotation
 from studio_server import Server, served
 
 from modeler.cli import parsed
 from modeler.sequences import open_sequence, write_bop
 from modeler.studio.guard import MOST_BYTES, Guard
 from modeler.studio.jobs import Job, Queue
-from modeler.studio.pictures import outline_svg, thumbnail
+from modeler.studio.pictures import outline_svg, ring_svg, thumbnail, turns_deg
 from modeler.studio.scan import Scan, Studio, drawn
 from modeler.types import BoolArray, InputError
 from studies.formats.image_folders import small_frames
@@ -208,10 +209,21 @@ def test_a_server_takes_over_the_command_that_one_before_it_has_started(tmp_path
     assert Queue(tmp_path / "jobs.json").current is None
 
 
+def turned(angle_deg: float) -> list[float]:
+    """Return a pose (16 numbers) turned about the vertical, which is -y in the camera."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.0, -np.radians(angle_deg), 0.0]).as_matrix()
+    return pose.ravel().tolist()
+
+
 def test_pictures_show_the_mask(scan: Scan) -> None:
     mask = scan.mask(0)
     assert outline_svg(None) == ""
     assert outline_svg(mask).count("<path") == 2
+    turns = [{"id": k, "object_from_camera": turned(30.0 * k)} for k in range(12)]
+    report = {"poses": turns, "up": [0.0, -1.0, 0.0]}
+    assert np.allclose(list(turns_deg(report).values()), 30.0 * np.arange(12))
+    assert ring_svg(report).count("<title>") == 12
     assert thumbnail(scan.sequence.frame(0), mask) != thumbnail(scan.sequence.frame(0), None)
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 
+from modeler.export import RunFolder
 from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import Overrides, WatchLimits
 from modeler.sequences.base import FIRST
@@ -96,6 +99,12 @@ class Capture:
             if line.startswith("frame "):
                 placed, words = "left out" not in line, line.partition(";")[0]
         return placed, words
+
+    def report(self) -> Mapping[str, Any] | None:
+        """Return the report of the run so far; None before there is one."""
+        with contextlib.suppress(InputError):
+            return RunFolder(Path(self.job.words[self.job.words.index("--out") + 1])).report()
+        return None
 
     def next(self) -> str:
         """Return what the build suggests to do next; "" before."""

@@ -16,7 +16,7 @@ from modeler.sequences.clouds import SUFFIXES
 from modeler.sequences.opening import BAGS
 from modeler.studio.capture import Capture
 from modeler.studio.jobs import Job
-from modeler.studio.pictures import box_svg, outline_svg, stroke_svg
+from modeler.studio.pictures import box_svg, outline_svg, ring_svg, stroke_svg
 from modeler.studio.scan import MESHES, Choices, Scan, Studio
 from modeler.types import ACCEPTED, InputError
 
@@ -224,7 +224,7 @@ class Page:
                     prior = ui.select(moves, value="auto", label="How does it move?").classes("w-full").props("dense")
                     with ui.row().classes("no-wrap items-center"):
                         step = ui.number("Step, degrees", value=20, step=1).props("dense")
-                        pause = ui.number("every, seconds", value=5, min=1, step=1).props("dense")
+                        pause = ui.number("Beat, seconds", value=5, min=1, step=1).props("dense")
                     step.bind_visibility_from(prior, "value", value="turntable")
                     ticks = ui.switch(
                         "Metronome", on_change=lambda event: self._tick(bool(event.value), pause.value or 5.0)
@@ -242,6 +242,7 @@ class Page:
                 with ui.element("div").classes("card") as self.light:
                     self.come = ui.label("Nothing is watched.").classes("text-h6").props("role=status")
                     self.come_more = ui.label().classes("quiet").style("white-space: pre-line")
+                    self.ring = ui.html("", sanitize=False)
                 self.capture_line = _line()
 
     async def _watch(self, folder: Path, prior: str | None, step_deg: float | None) -> None:
@@ -280,6 +281,8 @@ class Page:
         if capture.count:
             self.live.set_source(f"/capture/newest.jpg?v={capture.count}")
             self.live.set_content(outline_svg(capture.mask))
+        if (report := capture.report()) is not None:
+            self.ring.set_content(ring_svg(report))
         if placed is not None:
             ui.run_javascript(f"tone({660 if placed else 220})")
         if self.viewers.live == capture.job.line and not list(self.live_viewer):
@@ -581,6 +584,7 @@ class Page:
                 if camera:
                     self._calibrations(scan)
         with ui.element("div").classes("card"):
+            ui.html(ring_svg(report), sanitize=False)
             ui.button("What next? Suggest a turn", on_click=lambda: self._run([scan.suggest_job()])).props(
                 "no-caps outline"
             )
@@ -812,8 +816,8 @@ def _come(capture: Capture, placed: bool | None, words: str) -> str:
         )
     if placed:
         late = f" No new one for {capture.waits_s:.0f} s." if capture.waits_s > _LATE_S else ""
-        return f"{words}. Turn it: the next view may come.{late}"
-    return f"{words}. Turn it back a little, and try again."
+        return f"{words[:1].upper()}{words[1:]}. Turn it: the next view may come.{late}"
+    return f"{words[:1].upper()}{words[1:]}. Turn it back a little, and try again."
 
 
 def _entries(folder: Path) -> list[Path]:

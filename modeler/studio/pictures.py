@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from modeler.types import BoolArray, Frame
 from modeler.viz.entities import OUTLINE_RGB
@@ -75,6 +77,30 @@ def box_svg(corner: tuple[float, float], opposite: tuple[float, float]) -> str:
     return (
         f"<rect x='{x0:.1f}' y='{y0:.1f}' width='{x1 - x0:.1f}' height='{y1 - y0:.1f}' fill='none' stroke='white' "
         "stroke-width='2' stroke-dasharray='6 4' vector-effect='non-scaling-stroke'/>"
+    )
+
+
+def turns_deg(report: Mapping[str, Any]) -> dict[int, float]:
+    """Return how far the object had turned about the vertical in each view since the first, by frame number.
+
+    That is the twist of its rotation about the support's normal; without a support, about the image's vertical.
+    """
+    up = np.asarray(report.get("up") or (0.0, -1.0, 0.0), dtype=np.float64)
+    poses = {pose["id"]: np.reshape(pose["object_from_camera"], (4, 4))[:3, :3] for pose in report["poses"]}
+    turns = {k: Rotation.from_matrix(pose).as_quat() for k, pose in poses.items()}
+    return {k: float(np.degrees(2.0 * np.arctan2(turn[:3] @ up, turn[3]))) % 360.0 for k, turn in turns.items()}
+
+
+def ring_svg(report: Mapping[str, Any]) -> str:
+    """Return the views around the object, seen from above, as SVG: gaps in the ring are not seen yet."""
+    dots = ""
+    for k, turn_deg in turns_deg(report).items():
+        x, y = 50.0 + 38.0 * np.sin(np.radians(turn_deg)), 50.0 + 38.0 * np.cos(np.radians(turn_deg))
+        dots += f"<circle cx='{x:.1f}' cy='{y:.1f}' r='4' fill='#0b6b75'><title>frame {k}</title></circle>"
+    return (
+        "<svg viewBox='0 0 100 100' width='120' height='120' role='img' aria-label='Views around the object'>"
+        "<circle cx='50' cy='50' r='38' fill='none' stroke='#b9c3cc' stroke-width='2' stroke-dasharray='3 3'/>"
+        f"<rect x='42' y='42' width='16' height='16' rx='3' fill='#b9c3cc'/>{dots}</svg>"
     )
 
 
