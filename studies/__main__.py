@@ -48,7 +48,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "surfacing.captures": ("surfaces and colours of held-out views of captures", "minutes"),
     "surfacing.masks_and_models": ("draw depth, mask and model of runs", "seconds"),
     "symmetries": ("symmetries of shapes of known class", "minutes"),
-    "tracking": ("objects found with their models on cluttered tables and in captures", "an hour"),
+    "tracking": ("objects found and followed with their models: on cluttered tables and in captures", "an hour"),
     "trust": ("reliability of exit status 0, with and without faults", "20 minutes a core"),
     "turned_over": ("objects that are turned over within one recording", "half an hour"),
     "whole": ("models of captures that another renderer makes, every factor drawn at random", "half an hour a core"),

@@ -21,6 +21,8 @@ from studies.calibration.specimens import load_specimen
 
 _SENSOR = DepthSensor()
 _UNIT_M = 0.001
+_ASIDE = np.linspace(0.0, 1.5, 16)  # places of what hides the object: from before it to where it hides nothing
+_NEARER = 0.7  # share of the object's distance at which it is held
 VIEW: Final = Viewpoint()
 """The camera, 35° above a table 0.8 m away."""
 
@@ -71,14 +73,16 @@ def noise(distance_m: float, view: Viewpoint) -> SensorNoise:
     return SensorNoise(*_SENSOR.sigmas(distance_m, view.focal_px, _UNIT_M))
 
 
-def scene(sought: str | None, others: tuple[str, ...], seed: int, *, hidden: bool, view: Viewpoint = VIEW) -> Scene:
+def scene(
+    sought: str | None, others: tuple[str, ...], seed: int, *, hidden: float = 0.0, view: Viewpoint = VIEW
+) -> Scene:
     """Return an image of shapes that stand on a table, turned and placed as the seed has it.
 
     Args:
         sought: name of the shape whose truth is returned, in the middle; None: it is not there.
         others: names of those around it.
         seed: of all randomness.
-        hidden: whether the first of the others stands before it.
+        hidden: share of the object that the first of the others hides, held before it; the rest may, too.
         view: the camera.
     """
     rng = np.random.default_rng(seed)
@@ -93,18 +97,26 @@ def scene(sought: str | None, others: tuple[str, ...], seed: int, *, hidden: boo
     for number, name in enumerate((sought, *others)):
         if name is None:
             continue
+        turn = placement((0.0, 0.0, 0.0), (0.0, 0.0, float(rng.uniform(0.0, 360.0))))
         if number == 0:
             place_m = rng.uniform(-0.03, 0.03, 2)
-        elif number == 1 and hidden:  # towards the camera, to one side
-            place_m = np.array([rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.9) * reach_m, -(reach_m + _reach_m(name))])
+        elif number == 1 and hidden > 0.0 and pose is not None:  # held between camera and object, to one side
+            middle_m = _NEARER * se3.transform(pose, np.array([[0.0, 0.0, _height_m(sought)]]))[0]
+            side_m = rng.choice([-1.0, 1.0]) * (reach_m + _reach_m(name)) * np.array([1.0, 0.0, 0.0])
+            poses = [camera_from_table @ turn for _ in _ASIDE]
+            for one, share in zip(poses, _ASIDE, strict=True):
+                one[:3, 3] = middle_m + share * side_m - one[:3, 2] * _height_m(name)
+            caster = Caster(shape(name))
+            shares = [_share_hidden(placed[1], (caster, one), rays[::4, ::4]) for one in poses]
+            placed.append((caster, poses[int(np.argmin(np.abs(np.array(shares) - hidden)))]))
+            continue
         else:
             angle = around + 2.0 * np.pi * number / len(others) + rng.uniform(-0.3, 0.3)
             apart_m = reach_m + _reach_m(name) + rng.uniform(0.02, 0.08)
-            place_m = apart_m * np.array([np.cos(angle), abs(np.sin(angle)) if hidden else np.sin(angle)])
-        turned = placement((place_m[0], place_m[1], 0.0), (0.0, 0.0, float(rng.uniform(0.0, 360.0))))
-        placed.append((Caster(shape(name)), camera_from_table @ turned))
+            place_m = apart_m * np.array([np.cos(angle), np.sin(angle)])
+        placed.append((Caster(shape(name)), camera_from_table @ se3.translation(np.array([*place_m, 0.0])) @ turn))
         if number == 0:
-            pose = camera_from_table @ turned
+            pose = placed[-1][1]
     looked, nearest = None, np.full(rays.shape[:2], np.inf)
     for number, (caster, camera_from_mesh) in enumerate(placed):
         hits = caster.cast(rays, camera_from_mesh)
@@ -123,6 +135,18 @@ def scene(sought: str | None, others: tuple[str, ...], seed: int, *, hidden: boo
     depth_m = _SENSOR.measure(exposure, view.focal_px, rng)
     visible = float(np.count_nonzero(seen & whole) / max(np.count_nonzero(whole), 1))
     return Scene(Frame(seed, float(seed), depth_m, camera), seen & whole, visible if pose is not None else 0.0, pose)
+
+
+def _share_hidden(thing: tuple[Caster, Array], before: tuple[Caster, Array], rays: Array) -> float:
+    """Return the share of a thing that another hides, both as casters with camera_from_mesh, seen along rays (…, 3)."""
+    far_m, near_m = (caster.cast(rays, pose).depth_m for caster, pose in (thing, before))
+    shown = np.isfinite(far_m)
+    return float(np.count_nonzero(near_m[shown] < far_m[shown]) / max(np.count_nonzero(shown), 1))
+
+
+def _height_m(name: str | None) -> float:
+    """Return half the height of a shape on the table."""
+    return 0.0 if name is None else 0.5 * float(shape(name).vertices_m[:, 2].max())
 
 
 def _reach_m(name: str) -> float:
