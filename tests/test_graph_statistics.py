@@ -16,7 +16,7 @@ from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve
 from modeler.graph.covariance import chi_square_quantile
 from modeler.types import Array, Camera, Edge, Frame, PoseGaussian, RayImage, Solution
-from modeler.verdict.spreads import spread_of_positions
+from modeler.verdict.spreads import least_uncertain, spread_of_positions, spread_of_rotations
 from studies.loops import covariances
 
 SEEDS = 120
@@ -182,11 +182,22 @@ def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None
     alone, shifted = solve(graph, {}), solve(graph, {}, common_shift_m2=shift)
     seen = RayImage(Frame(0, 0.0, np.zeros((1, 1), np.float32), CAMERA), None, 0.0, 0.0, OBJECT_M[None], OBJECT_M[None],
                     np.zeros((1, 2), np.int64))  # fmt: skip
-    spreads = [spread_of_positions(dict.fromkeys(TRUTH, seen), solution, 0.005) for solution in (alone, shifted)]
+    spreads = [spread_of_positions(dict.fromkeys(TRUTH, seen), solution, 0.005, 0) for solution in (alone, shifted)]
     assert spreads[0] is not None
     assert spreads[1] is not None
     assert spreads[1].check.value == pytest.approx(spreads[0].check.value, rel=1e-6)
     assert np.trace(shifted.covariances[COUNT // 2][3:, 3:]) > 2.0 * np.trace(alone.covariances[COUNT // 2][3:, 3:])
+
+
+def test_a_model_is_judged_from_its_best_known_frame() -> None:
+    """Along a chain that is the middle one, from which the ends are half as far."""
+    motion = PoseGaussian(spin([0.0, 0.3, 0.0]), np.diag(np.repeat([0.01, 0.002], 3) ** 2))
+    solution = solve(PoseGraph(tuple(edge(k - 1, k, motion) for k in range(1, 9))), {})
+    assert least_uncertain(solution) == 4
+    ends = [spread_of_rotations(solution, reference) for reference in (0, 4)]
+    assert ends[0] is not None
+    assert ends[1] is not None
+    assert ends[1].check.value < 0.8 * ends[0].check.value
 
 
 def test_no_loop_tells_what_all_views_err_by() -> None:

@@ -49,7 +49,7 @@ from modeler.verdict.evidence import (
     prior_check,
     prior_distances,
 )
-from modeler.verdict.spreads import misfit, one_axis_sd, spread_of_positions, spread_of_rotations
+from modeler.verdict.spreads import least_uncertain, misfit, one_axis_sd, spread_of_positions, spread_of_rotations
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 AXES_M = np.array([0.09, 0.05, 0.03])
@@ -321,7 +321,7 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
             poses,
             {frame: away[frame] @ (spread if frame == 2 else ABOUT_OBJECT) @ away[frame].T for frame in poses},
         )
-        turn, place = spread_of_rotations(solution), spread_of_positions(views, solution, 0.005)
+        turn, place = spread_of_rotations(solution, 0), spread_of_positions(views, solution, 0.005, 0)
         assert turn is not None
         assert place is not None
         assert (turn.frame, turn.check.holds) == (2, turn_holds)
@@ -329,11 +329,11 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
         assert place.check.value == pytest.approx(np.hypot(sigma_m, 0.0005), rel=0.02)
         drawn_deg = np.abs(turn.check.value * rng.normal(size=20_000))
         assert bool(np.mean(drawn_deg > 3.0) < 0.05) is turn_holds
-    wider = spread_of_rotations(solution, 2.0)
+    wider = spread_of_rotations(solution, 0, 2.0)
     assert wider is not None
     assert 1.9 < wider.check.value / turn.check.value < 2.2
-    assert spread_of_rotations(Solution()) is None
-    assert spread_of_positions(views, Solution(), 0.005) is None
+    assert spread_of_rotations(Solution(), least_uncertain(Solution())) is None
+    assert spread_of_positions(views, Solution(), 0.005, None) is None
 
 
 @pytest.mark.parametrize("sigmas_deg", [(1.5, 0.0, 0.0), (1.5, 0.6, 0.5), (1.3, 1.3, 0.1), (1.0, 1.0, 1.0)])

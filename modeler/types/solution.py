@@ -222,6 +222,11 @@ class Solution:
     def _left_out(self) -> frozenset[Edge]:
         return frozenset(self.outliers)
 
+    @property
+    def knows_motions(self) -> bool:
+        """Whether covariances of motions between any two frames can be computed."""
+        return self.relative_covariance is not _unsolved
+
     def pose_of(self, edge: Edge) -> PoseGaussian:
         """Return target_from_source of an edge as it entered the graph; several modes are weighted by all edges."""
         posterior = edge.posterior

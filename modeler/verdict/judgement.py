@@ -48,6 +48,7 @@ from modeler.verdict.evidence import (
     prior_distances,
 )
 from modeler.verdict.spreads import (
+    least_uncertain,
     misfit,
     size_check,
     spread_of_positions,
@@ -209,11 +210,12 @@ def _colour(step: Step) -> list[_Finding]:
 def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Finding]:
     """Return the uncertainty of the poses of a whole run."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
-    if (turn := spread_of_rotations(step.solution, factor)) is not None:
+    reference = least_uncertain(step.solution)
+    if (turn := spread_of_rotations(step.solution, reference, factor)) is not None:
         words = f"the rotation of frame {turn.frame} is uncertain by {turn.check.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.check.limit:.1f}°" if turn.count > 1 else ""
         found.append(_Finding("pose_sd_deg", turn.check, "unsure_rotation", words))
-    if (place := spread_of_positions(step.views, step.solution, tolerance_m, factor)) is not None:
+    if (place := spread_of_positions(step.views, step.solution, tolerance_m, reference, factor)) is not None:
         value_mm, limit_mm = 1000.0 * place.check.value, 1000.0 * place.check.limit
         words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
         words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""

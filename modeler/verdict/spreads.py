@@ -14,6 +14,7 @@ from modeler import se3
 from modeler.types import Array, Check, Edge, FocalLength, RayImage, Solution
 from modeler.verdict.evidence import MAX_POINTS, MAX_VIOLATIONS, WRONG_RAD, WRONG_SHARE, graph_check
 
+_CANDIDATES: Final = 16  # for the frame that all others are compared with: 240 motions take a tenth of a second
 _NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then accurate to 0.1 %
 
 
@@ -42,24 +43,52 @@ def misfit(edges: Sequence[Edge], solution: Solution) -> float:
     return 1.0 if fit is None else float(np.sqrt(max(fit.value, 1.0)))
 
 
-def spread_of_rotations(solution: Solution, factor: float = 1.0) -> Spread | None:
+def least_uncertain(solution: Solution) -> int | None:
+    """Return the frame relative to which the rotations of all others are known best; None without a pose.
+
+    The model is the same relative to any of its frames, but an error of the first one would be one of all others.
+    Candidates are frames spread over the run, compared by the worst of each other's rotations.
+    """
+    frames = sorted(solution.trajectory)
+    if not solution.knows_motions or len(frames) < 2:
+        return min(frames, default=None)
+    some = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, _CANDIDATES).astype(np.int64)).tolist()]
+    worst = {
+        reference: max(
+            float(np.linalg.eigvalsh(_given_focal_length(solution, frame, reference)[:3, :3])[-1])
+            for frame in some
+            if frame != reference
+        )
+        for reference in some
+    }
+    return min(some, key=worst.__getitem__)
+
+
+def spread_of_rotations(solution: Solution, reference: int | None, factor: float = 1.0) -> Spread | None:
     """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
 
     What a wrong focal length does to the model is part of its size (`size_check`) and of `spread_of_positions`.
 
     Args:
         solution: the poses.
+        reference: the frame without error; None without a pose.
         factor: on the standard deviations: `misfit`.
     """
+    if reference is None:
+        return None
     sigmas_deg = {}
-    for frame, covariance in solution.covariances.items():
-        given_focal = (covariance - _of_focal_length(solution, frame))[:3, :3]
+    for frame in solution.covariances:
+        given_focal = _given_focal_length(solution, frame, reference)[:3, :3]
         sigmas_deg[frame] = float(np.degrees(one_axis_sd(factor**2 * given_focal, WRONG_RAD)))
     return _widest(sigmas_deg, float(np.degrees(WRONG_RAD)))
 
 
 def spread_of_positions(
-    views: Mapping[int, RayImage], solution: Solution, tolerance_m: float, factor: float = 1.0
+    views: Mapping[int, RayImage],
+    solution: Solution,
+    tolerance_m: float,
+    reference: int | None,
+    factor: float = 1.0,
 ) -> Spread | None:
     """Return the largest uncertainty of the surface's position in a pose, in m; None without a pose.
 
@@ -70,27 +99,33 @@ def spread_of_positions(
         views: by frame number; the position is that of a view's centroid.
         solution: the poses.
         tolerance_m: error of the surface above which a model is wrong.
+        reference: the frame without error; None without a pose.
         factor: on the standard deviations: `misfit`.
     """
+    if reference is None:
+        return None
     sigmas_m, deformed_m = {}, deformation_by_focal_length(views, solution)
-    for frame, covariance in solution.covariances.items():
+    for frame in solution.covariances:
         if frame in views and len(views[frame].points_m):
-            given_focal = covariance - _of_focal_length(solution, frame)
+            given_focal = _given_focal_length(solution, frame, reference)
             of_place = se3.covariance_about(given_focal, views[frame].centroid_m)[3:, 3:]
-            of_place = of_place - _of_common_shift(solution, frame)
+            of_place = of_place - _of_common_shift(solution, frame, reference)
             given_m = one_axis_sd(factor**2 * of_place, tolerance_m)
             sigmas_m[frame] = float(np.hypot(given_m, deformed_m.get(frame, 0.0)))
     widest = _widest(sigmas_m, tolerance_m)
     return None if widest is None else replace(widest, by_focal_m=deformed_m.get(widest.frame, 0.0))
 
 
-def _of_focal_length(solution: Solution, frame: int) -> Array:
-    """Return the covariance (6, 6) of a pose due to the focal length alone."""
+def _given_focal_length(solution: Solution, frame: int, reference: int) -> Array:
+    """Return the covariance (6, 6) of a frame's pose relative to another without what is due to the focal length."""
+    known = solution.knows_motions
+    covariance = solution.relative_covariance(reference, frame) if known else solution.covariances[frame]
     focal = solution.focal
     if focal is None or frame not in focal.by_focal:
-        return np.zeros((6, 6))
-    xi = focal.sigma * se3.adjoint(se3.inverse(solution.trajectory[frame])) @ focal.by_focal[frame]  # eq. 10.6
-    return np.outer(xi, xi)
+        return covariance
+    apart = focal.by_focal[frame] - (focal.by_focal.get(reference, 0.0) if known else 0.0)
+    xi = focal.sigma * se3.adjoint(se3.inverse(solution.trajectory[frame])) @ apart  # eq. 10.6
+    return covariance - np.outer(xi, xi)
 
 
 def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solution) -> dict[int, float]:
@@ -121,11 +156,11 @@ def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solutio
     }
 
 
-def _of_common_shift(solution: Solution, frame: int) -> Array:
+def _of_common_shift(solution: Solution, frame: int, reference: int) -> Array:
     """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method, eq. 8.10)."""
     if solution.common_shift_m2 is None:
         return np.zeros((3, 3))
-    left = np.eye(3) - solution.trajectory[frame][:3, :3].T  # the pose of the graph's root is the identity
+    left = np.eye(3) - solution.trajectory[frame][:3, :3].T @ solution.trajectory[reference][:3, :3]
     return np.asarray(left @ solution.common_shift_m2 @ left.T, dtype=np.float64)
 
 
