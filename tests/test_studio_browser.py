@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from studio_server import EXECUTABLE, FLAGS, Server, end, needs_browser, served
 
@@ -22,6 +21,27 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="needs Playwright")
 pytestmark = needs_browser
 CAPTURES = Path(__file__).parents[1].parent / "shared" / "data"
 PATIENCE_MS = 90_000
+STEPS = ("Files", "Capture", "Object", "Build", "Check", "Take away", "Scans")
+_FAINT = """() => {
+  const channels = (colour) => (colour.match(/[\\d.]+/g) || [0, 0, 0, 0]).map(Number);
+  const linear = (c) => (c <= 0.03928 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+  const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+  const behind = (element) => {
+    for (let at = element; at; at = at.parentElement) {
+      const rgba = channels(getComputedStyle(at).backgroundColor);
+      if (rgba.length < 4 || rgba[3] > 0.5) return rgba;
+    }
+    return [255, 255, 255];
+  };
+  const faint = (element) => {
+    const lights = [channels(getComputedStyle(element).color), behind(element)].map(light);
+    return (Math.max(...lights) + 0.05) / (Math.min(...lights) + 0.05) < 4.5;
+  };
+  const says = (element) => [...element.childNodes].some((node) => node.nodeType === 3 && node.data.trim());
+  return [...document.querySelectorAll('body *')]
+    .filter((element) => element.checkVisibility() && !element.closest(':disabled') && says(element) && faint(element))
+    .map((element) => element.innerText);
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +99,10 @@ class Window:
 
     def drag(self, *places: tuple[float, float]) -> None:
         """Drag across the frame, along places in px of the image."""
-        image = self.page.locator(".photo img")
-        self.page.wait_for_function("document.querySelector('.photo img').naturalWidth > 0")
-        box, natural = image.bounding_box(), image.evaluate("image => [image.naturalWidth, image.naturalHeight]")
+        image = self.page.get_by_label("The frame with the outline of the object").locator("img")
+        while not (natural := image.evaluate("image => [image.naturalWidth, image.naturalHeight]"))[0]:
+            time.sleep(0.05)
+        box = image.bounding_box()
         points = [
             (box["x"] + x * box["width"] / natural[0], box["y"] + y * box["height"] / natural[1]) for x, y in places
         ]
@@ -92,12 +113,16 @@ class Window:
             self.page.mouse.move(*point, steps=6)
         self.page.mouse.up()
 
+    def faint(self) -> list[str]:
+        """Return visible words of which the contrast is below 4.5 to 1, the least that WCAG 2 asks of text."""
+        return self.page.evaluate(_FAINT)
+
     def fits(self) -> bool:
         """Whether nothing sticks out at the side."""
         return bool(self.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"))
 
 
-def test_a_capture_becomes_an_exported_model_while_the_page_answers(
+def test_a_capture_becomes_an_exported_model_which_a_second_page_shows_too(
     browser: Any, capture: Path, tmp_path: Path
 ) -> None:
     with served(capture, tmp_path / "studio") as server:
@@ -108,15 +133,7 @@ def test_a_capture_becomes_an_exported_model_while_the_page_answers(
         assert other.fits()
         window.click("button", "Next: build")
         window.click("button", "Build the model")
-        times_ms = []
-        while (
-            window.page.get_by_text("This model can be trusted").or_(window.page.get_by_text("Do not trust")).count()
-            == 0
-        ):
-            times_ms.append(answered_ms(window.page))
-            time.sleep(0.2)
-            assert len(times_ms) < 1000
-        assert statistics.median(times_ms) < 100.0
+        window.sees("frames placed")
         other.click("tab", "Check")
         other.sees("frames placed")
         window.page.get_by_role("button", name="Stop").wait_for(state="hidden")
@@ -128,16 +145,31 @@ def test_a_capture_becomes_an_exported_model_while_the_page_answers(
         assert size == (tmp_path / "studio" / "box" / "take-away" / "box.stl").stat().st_size > 1000
         report = RunFolder(tmp_path / "studio" / "box" / "run-1").report()
         assert len(report["poses"]) == 5
+        for number, step in enumerate(STEPS, start=1):
+            window.page.keyboard.press(str(number))
+            window.page.locator(".panel:not(.hidden)").nth(0).wait_for()
+            assert window.page.get_by_role("tab", name=step, exact=True).get_attribute("aria-selected") == "true"
+            assert window.faint() == []
+            assert window.fits()
+            other.click("tab", step)
+            assert other.fits()
         assert (window.faults, other.faults) == ([], [])
         assert window.hosts == other.hosts == {f"127.0.0.1:{server.port}"}
 
 
 def answered_ms(page: Any) -> float:
-    """Return how long the page takes to answer a click on another step, as a person sees it."""
-    asked = "document.querySelector('[role=status]') && fetch('/thumbnails/box/0.jpg').then(() => performance.now())"
-    return float(
-        page.evaluate(f"(async () => {{ const before = performance.now(); return await ({asked}) - before }})()")
-    )
+    """Return how long a click on another step and one back take until the step is shown, the longer of both."""
+    script = """async (names) => {
+      let longest = 0;
+      for (const [name, number] of names) {
+        const panel = document.querySelectorAll('.panel')[number], before = performance.now();
+        [...document.querySelectorAll('[role=tab]')].find((tab) => tab.innerText.trim() === name).click();
+        while (panel.classList.contains('hidden')) await new Promise((done) => setTimeout(done, 1));
+        longest = Math.max(longest, performance.now() - before);
+      }
+      return longest;
+    }"""
+    return float(page.evaluate(script, [["Files", 0], ["Build", 3]]))
 
 
 @pytest.mark.slow
@@ -175,30 +207,49 @@ def test_what_was_painted_and_chosen_survives_a_server_that_is_killed(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.skipif(not (CAPTURES / "cap").exists(), reason="the captures are not here")
-def test_a_wrong_mask_of_the_cap_is_mended_by_one_box(browser: Any, tmp_path: Path) -> None:
+def test_a_wrong_mask_of_the_cap_is_mended_by_one_box_and_frames_are_dropped_and_put_back(
+    browser: Any, tmp_path: Path
+) -> None:
+    folder = tmp_path / "studio" / "cap"
     with served(CAPTURES / "cap", tmp_path / "studio") as server:
         window = Window(browser, server)
+        window.page.set_default_timeout(300_000)
         window.sees("19 frames.")
-        window.drag((20.0, 20.0), (120.0, 140.0))  # a wrong one: the wall
+        window.drag((20.0, 20.0), (120.0, 140.0))  # a wrong one: the room behind
         window.sees("Look at frames")
         began_s, window.clicks = time.monotonic(), 0
-        window.drag((200.0, 120.0), (460.0, 400.0))
-        window.page.get_by_text("19 frames.").first.wait_for()
+        window.drag((180.0, 120.0), (460.0, 400.0))
+        window.page.get_by_text("19 frames.", exact=True).wait_for()
         window.click("button", "Next: build")
         window.click("button", "Build the model")
+        verdict, times_ms = window.page.get_by_text("frames placed"), list[float]()
+        while not verdict.count():
+            times_ms.append(answered_ms(window.page))
+            time.sleep(0.2)
+        assert statistics.median(times_ms) < 100.0, times_ms
+        print(f"answers in {statistics.median(times_ms):.0f} ms, at most {max(times_ms):.0f} ms")
         window.sees("frames placed")
         window.click("button", "Next: take it away")
-        window.page.get_by_role("button", name="GLB").click()
-        window.page.get_by_role("link", name="cap.glb", exact=True).click()
-        print(f"cap: {window.clicks + 2} clicks, {time.monotonic() - began_s:.0f} s")
-        report = RunFolder(tmp_path / "studio" / "cap" / "run-1").report()
-        assert len(report["poses"]) == 19
+        window.clicks += 2
+        window.page.get_by_role("button", name="STL").click()
+        window.page.get_by_role("link", name="cap.stl", exact=True).click()
+        assert window.clicks <= 8
+        print(f"cap: {window.clicks} clicks, {time.monotonic() - began_s:.0f} s")
+        report = RunFolder(folder / "run-1").report()
         assert report["trustworthy"], report["reasons"]
-        turned = np.degrees(
-            np.arccos(
-                np.clip((np.trace(np.reshape(report["poses"][9]["object_from_camera"], (4, 4))[:3, :3]) - 1) / 2, -1, 1)
-            )
-        )
-        assert turned > 90.0
+        assert len(report["poses"]) == 19
+        assert report["settings"]["roi"] == [180, 120, 461, 401]
+        window.click("tab", "Check")
+        began_s = time.monotonic()
+        strip = window.page.get_by_label("Frames of the model")
+        strip.get_by_label("frame 7", exact=True).click()
+        window.sees("18 of 18 frames placed")
+        print(f"re-optimised in {time.monotonic() - began_s:.1f} s")
+        assert len(RunFolder(folder / "run-1-edited").report()["poses"]) == 18
+        window.page.get_by_role("button", name="Stop").wait_for(state="hidden")
+        strip.get_by_label("frame 7", exact=True).click()
+        window.sees("19 of 19 frames placed")
+        assert len(RunFolder(folder / "run-1").report()["poses"]) == 19
         assert window.faults == []

@@ -99,13 +99,13 @@ class Choices:
 class Scan:
     """A capture being made into a model. Methods may be called from any thread."""
 
-    def __init__(self, folder: Path, choices: Choices, queue: Queue) -> None:
+    def __init__(self, folder: Path, choices: Choices) -> None:
         """Open a capture, and begin to look for the object in it.
 
         Raises:
             InputError: if it cannot be read.
         """
-        self.folder, self.choices, self.queue = folder, choices, queue
+        self.folder, self.choices = folder, choices
         self.sequence: AbstractSequence = KeptSequence(open_sequence(Path(choices.sequence)))
         self.version = 0
         """Grows with every change that pages show."""
@@ -303,7 +303,7 @@ class Scan:
     def suggest_job(self) -> Job:
         """Return the ranking of what to do next."""
         run = self._some_run()
-        return Job(("suggest", str(run)), self.folder / "suggest.log", "Looking for the next turn")
+        return Job(("suggest", str(run)), self.folder / f"{run.name}-suggest.log", "Looking for the next turn")
 
     def suggested(self) -> str:
         """Return what was suggested to be done next, for the latest run, a line each; "" before."""
@@ -509,7 +509,7 @@ class Studio:
         """
         folder, choices = self._chosen(sequence)
         if folder not in self._scans:
-            scan = self._scans[folder] = Scan(folder, choices, self.queue)
+            scan = self._scans[folder] = Scan(folder, choices)
             scan._choose()
         self.show(self._scans[folder])
         return self._scans[folder]

@@ -25,7 +25,7 @@ from nicegui import ui
 from modeler.batch.models import thumbnail_of
 from modeler.export import RunFolder
 from modeler.studio.guard import MOST_BYTES, Guard
-from modeler.studio.pages import Page
+from modeler.studio.page import Page
 from modeler.studio.pictures import jpeg, thumbnail
 from modeler.studio.scan import Scan, Studio
 from modeler.system.regular_files import check_regular
@@ -52,21 +52,21 @@ class Viewers:
     token: str
     """For the viewer, which asks for recordings without cookies."""
     live: str = ""
-    """The command line of the build that it shows."""
+    """The run folder of the build that it shows."""
     _viewer: Viewer | None = field(default=None, repr=False)
     _files: dict[str, tuple[bytes, str]] = field(default_factory=dict, repr=False)
 
-    def sink(self, line: str) -> str:
-        """Return where the build of a command line is to send its recording: to a viewer of its own."""
+    def sink(self, run: str) -> str:
+        """Return where the build of a run folder is to send its recording: to a viewer of its own."""
         self.stop()
-        self._viewer, self.live = start_web(), line
+        self._viewer, self.live = start_web(), run
         return self._viewer.sink
 
     def address(self, scan: Scan | None) -> str:
         """Return the address of the viewer with the build that runs, else with the latest run of a scan."""
         source = self._started().sink
-        if not self.live and scan is not None:
-            run = "" if scan.run is None else scan.run.name
+        if scan is not None and scan.run is not None and self.live != str(scan.run) and not self._awaited:
+            run = scan.run.name
             source = f"{self.server}/runs/{quote(scan.name)}/{quote(run)}/recording.rrd?token={self.token}"
         return f"/viewer/?url={quote(source, safe='')}&renderer=webgl"
 
@@ -90,6 +90,11 @@ class Viewers:
         if self._viewer is not None:
             self._viewer.stop()
         self._viewer, self.live = None, ""
+
+    @property
+    def _awaited(self) -> bool:
+        """Whether the build that it shows has not made its folder yet."""
+        return bool(self.live) and not Path(self.live).exists()
 
     def _started(self) -> Viewer:
         if self._viewer is None or self._viewer.process.poll() is not None:

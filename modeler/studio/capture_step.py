@@ -1,0 +1,145 @@
+"""Where a folder that a camera program writes is followed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, final
+
+from nicegui import run, ui
+
+from modeler.studio.capture import Capture
+from modeler.studio.pictures import outline_svg, ring_svg
+from modeler.studio.widgets import (
+    PRIORS,
+    command_line,
+    complain,
+    div,
+    embedded_viewer,
+    heading,
+    main_button,
+    quiet,
+    sentence,
+)
+from modeler.types import InputError
+
+if TYPE_CHECKING:
+    from modeler.studio.page import Page
+
+_LATE_S: Final = 15.0  # without a frame: longer than a person takes to turn an object by hand
+_BEAT_S: Final = 5.0  # of the metronome, to begin with
+_TICK_HZ, _PLACED_HZ, _LOST_HZ = 880, 660, 220  # notes that are told apart
+TONE: Final = """<script>
+window.tone = (hertz) => {
+  window.sound = window.sound || new AudioContext();
+  const tone = sound.createOscillator(), quiet = sound.createGain();
+  tone.frequency.value = hertz; quiet.gain.value = 0.1;
+  tone.connect(quiet).connect(sound.destination); tone.start(); tone.stop(sound.currentTime + 0.12);
+};
+</script>"""
+"""Script that plays a note."""
+
+
+@final
+class CaptureStep:
+    """Following a capture."""
+
+    def __init__(self, page: Page, panel: ui.element) -> None:
+        """Prepare the step."""
+        self.page, self.panel = page, panel
+        self._shown = ""
+
+    def draw(self) -> None:
+        """Draw what a capture needs."""
+        self.panel.clear()
+        self._shown = ""
+        with self.panel:
+            with div("wide"):
+                self.live = ui.interactive_image().classes("photo").props("role=img aria-label='The newest frame'")
+                self.viewer = div("w-full q-mt-sm")
+            with div("side first column gap-3"):
+                with div("card"):
+                    heading("Take a capture")
+                    quiet(
+                        "Have a camera program write depth images into a folder, turn the object a little between two "
+                        "frames, and watch the model grow."
+                    )
+                    self._choices()
+                with div("card") as self.light:
+                    self.come = heading("Nothing is watched.").props("role=status")
+                    self.more = quiet()
+                    self.ring = ui.html("", sanitize=False)
+                self.line = command_line()
+
+    def _choices(self) -> None:
+        folder = ui.input("Folder", value=str(self.page.files.place)).classes("w-full").props("dense outlined")
+        moves = {name: label for name, (label, *_) in PRIORS.items() if name != "held"}
+        prior = ui.select(moves, value="auto", label="How does it move?").classes("w-full").props("dense")
+        with ui.row().classes("no-wrap items-center"):
+            step = ui.number("Step, degrees", value=20, step=1).props("dense")
+            beat = ui.number("Beat, seconds", value=_BEAT_S, min=1, step=1).props("dense")
+        step.bind_visibility_from(prior, "value", value="turntable")
+        ticks = ui.switch("Metronome", on_change=lambda event: _tick(bool(event.value), beat.value or _BEAT_S))
+        ticks.props("aria-label='Metronome: a tick for each step'")
+        beat.on_value_change(lambda: _tick(bool(ticks.value), beat.value or _BEAT_S))
+
+        async def watch() -> None:
+            chosen = None if prior.value == "auto" else prior.value
+            await self._watch(Path(folder.value or "."), chosen, step.value if chosen == "turntable" else None)
+
+        main_button("Watch the folder", watch)
+
+    async def _watch(self, folder: Path, prior: str | None, step_deg: float | None) -> None:
+        """Follow a folder that is being written."""
+        if self.page.busy():
+            return
+        try:
+            jobs = await run.io_bound(self.page.studio.watch, folder.expanduser(), prior, step_deg) or []
+            await self.page.run(jobs)
+        except InputError as error:
+            complain(error)
+
+    def follow(self) -> None:
+        """Show what has come."""
+        capture = self.page.studio.capture
+        if capture is None or self.page.step != "Capture":
+            return
+        placed, words = capture.said()
+        self.come.text = _come(capture, placed, words)
+        self.line.text = capture.job.line
+        lines = [*capture.doubts(), *capture.facts(), capture.next()]
+        self.more.text = "\n".join(filter(None, map(sentence, lines)))
+        shown = f"{capture.count} {words} {capture.next()}"
+        if shown == self._shown:
+            return
+        self._shown = shown
+        self.light.classes(replace=f"card {'' if placed is None else 'good' if placed else 'bad'}")
+        if capture.count:
+            self.live.set_source(f"/capture/newest.jpg?v={capture.count}")
+            self.live.set_content(outline_svg(capture.mask))
+        if (report := capture.report()) is not None:
+            self.ring.set_content(ring_svg(report))
+        if placed is not None:
+            ui.run_javascript(f"tone({_PLACED_HZ if placed else _LOST_HZ})")
+        if self.page.viewers.live and not list(self.viewer):
+            with self.viewer:
+                embedded_viewer(self.page.viewers.address(None))
+
+
+def _tick(on: bool, beat_s: float) -> None:
+    """Tick for each step of a turntable, or stop ticking."""
+    beat = f"window.beat = setInterval(() => tone({_TICK_HZ}), {1000.0 * max(beat_s, 0.5):.0f})" if on else ""
+    ui.run_javascript(f"clearInterval(window.beat); {beat}")
+
+
+def _come(capture: Capture, placed: bool | None, words: str) -> str:
+    """Return in words whether the next view may come."""
+    if not capture.job.running:
+        return sentence(capture.job.failure or "the capture has ended")
+    if placed is None:
+        return (
+            f"{capture.count} frames; the model begins with the first few." if capture.count else "Waiting for frames."
+        )
+    if placed:
+        late = f" No new one for {capture.waits_s:.0f} s." if capture.waits_s > _LATE_S else ""
+        return f"{sentence(words)} Turn it: the next view may come.{late}"
+    return f"{sentence(words)} Turn it back a little, and try again."
