@@ -64,8 +64,8 @@ _SETTINGS: Final = {
 }
 _LIMITS: Final = ("-n 8", "-n 40", "-n 300", "-f 100", "-f 2000", "-v 400000", "-v 3000000", "-s 256")
 _ENDED: Final = (0, 2, 3)
-_LIMIT_S: Final = 150.0  # with kernels to compile, and other work on the machine
-_LEAVES_S: Final = 20.0  # after a signal
+_LIMIT_S: Final = 150.0  # with kernels to compile; where the machine is idle, as below
+_LEAVES_S: Final = 10.0  # after a signal
 
 
 @dataclass
@@ -186,10 +186,10 @@ def outcome(trial: Trial, command: tuple[str, ...]) -> str:
                     process.wait(after_s)
                 except subprocess.TimeoutExpired:
                     process.send_signal(number)
-            process.wait(_LIMIT_S if trial.signalled is None else _LEAVES_S)
+            process.wait(_busy() * (_LIMIT_S if trial.signalled is None else _LEAVES_S))
         except subprocess.TimeoutExpired:
             fault = f"does not end in {time.monotonic() - began_s:.0f} s"
-        time.sleep(0.2)
+        time.sleep(0.2 * _busy())
         try:
             os.killpg(process.pid, signal.SIGKILL)
             fault = fault or "leaves a process behind"
@@ -205,6 +205,11 @@ def outcome(trial: Trial, command: tuple[str, ...]) -> str:
     if "Traceback" in words or "panicked" in words or process.returncode not in allowed:
         return f"ends with status {process.returncode}: {words[-400:]}"
     return "runs a file of the current folder" if (trial.folder / "ran").exists() else ""
+
+
+def _busy() -> float:
+    """Return how many times longer work takes as others wait for the processors, too."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def main() -> int:
