@@ -250,7 +250,7 @@ def camera_of(node: Node, name: str) -> CameraFacts:
 
 
 def cameras_of_frames(path: Path, stems: Iterable[str], size: tuple[int, int]) -> dict[str, CameraFacts]:
-    """Return the camera of each image by its name, as Polycam writes them beside its images; {} without.
+    """Return the camera of each image by its name, as Polycam and `transforms.json` have them; {} without.
 
     Args:
         path: the folder.
@@ -260,6 +260,19 @@ def cameras_of_frames(path: Path, stems: Iterable[str], size: tuple[int, int]) -
     Raises:
         InputError: if a file of a camera cannot be read.
     """
+    if is_there(path / "transforms.json"):
+        whole = read_tree(path / "transforms.json")
+        frames = whole.get("frames")
+        common = {key: node.value for key, node in whole.items().items() if key != "frames"}
+        found = {
+            Path(depth.text()).stem: camera_of(
+                Node({**common, **{key: node.value for key, node in frame.items().items()}}, whole.path, frame.keys),
+                "transforms.json",
+            ).scaled(size)
+            for frame in (() if frames is None else frames.elements())
+            if (depth := frame.get("depth_file_path")) is not None and _describes_camera(frame)
+        }
+        return found if {*stems} <= found.keys() else {}
     files = {stem: path / "cameras" / f"{stem}.json" for stem in stems}
     if not all(map(is_there, files.values())):
         return {}

@@ -197,3 +197,15 @@ def test_digests_are_of_content(frames: list[Frame], tmp_path: Path) -> None:
     first, again, other = digests(tmp_path / "a", 0), digests(tmp_path / "b", 0), digests(tmp_path / "c", 1)
     assert first == again
     assert [index for index in first if first[index] != other[index]] == [2]
+
+
+def test_frames_of_nerfstudio_have_cameras_of_their_own(tmp_path: Path, frames: list[Frame]) -> None:
+    shots = []
+    for frame in frames:
+        name, camera = f"frame_{frame.index:05d}.png", frame.camera
+        save(tmp_path / "depth" / name, raw_depth(frame, 1.0))
+        facts = {"fl_x": camera.fx + frame.index, "fl_y": camera.fy, "cx": camera.cx + 0.5, "cy": camera.cy + 0.5}
+        shots.append(facts | {"depth_file_path": f"depth/{name}", "transform_matrix": np.eye(4).tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 160, "h": 120, "frames": shots}))
+    for read, wrote in zip(open_sequence(tmp_path), frames, strict=True):
+        assert read.camera == replace(wrote.camera, fx=wrote.camera.fx + wrote.index)

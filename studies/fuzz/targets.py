@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import importlib.util
 import io
 import json
 import shutil
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
+from PIL import Image
 from rosbags import rosbag1, rosbag2
 
 from modeler import se3, sequences
@@ -60,7 +64,15 @@ def truth(count: int = 2) -> dict[int, np.ndarray]:
 
 
 def read_all(path: Path) -> object:
-    """Read every frame and the truth, as `modeler info` does."""
+    """Read every frame and the truth; what `info` computes of them (`inspect`) takes twenty times as long."""
+    sequence = open_sequence(path)
+    for index in sequence.indices:
+        sequence.frame(index)
+    return sequence.truth(), sequence.sensor(), sequence.motion, sequence.notes
+
+
+def inspect(path: Path) -> object:
+    """Read every frame and the truth, and look at them as `info` does."""
     return survey(open_sequence(path))
 
 
@@ -124,6 +136,7 @@ def _noise(folder: Path) -> Path:
 TARGETS: dict[str, Target] = {
     "bop": Target(_bop, ("s/*.json",), read_all, 2.0),
     "png": Target(_bop, ("s/depth/*", "s/mask_visib/*"), read_all, 2.0),
+    "info": Target(_bop, ("s/depth/*", "s/mask_visib/*", "s/*.json"), inspect, 0.2),
     "jpg": Target(_bop, ("s/rgb/*",), read_all),
     "tiff": Target(_tiff, ("s/depth/*",), read_all),
     "tum": Target(_written(image_folders.write_tum), ("s/*.txt",), read_all, 2.0),
@@ -173,6 +186,93 @@ def _intrinsics(name: str, content: str) -> Callable[[Path], Path]:
         return folder / "s"
 
     return make
+
+
+def _listed(folder: Path) -> Path:
+    """Write a folder of nerfstudio, each camera on its own."""
+    shots = []
+    for frame in tiny():
+        image_folders.save(folder / "s" / "depth" / f"{frame.index}.png", image_folders.raw_depth(frame, 1.0))
+        assert frame.colour is not None
+        image_folders.save(folder / "s" / "images" / f"{frame.index}.png", frame.colour)
+        paths = {"file_path": f"images/{frame.index}.png", "depth_file_path": f"depth/{frame.index}.png"}
+        camera = {"fl_x": 30.0 + frame.index, "fl_y": 30.5, "cx": 12.0, "cy": 8.0}
+        shots.append(paths | camera | {"transform_matrix": np.eye(4).tolist()})
+    lens = {"w": 24, "h": 16, "camera_model": "OPENCV", "k1": 0.01, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    (folder / "s" / "transforms.json").write_text(json.dumps(lens | {"frames": shots}))
+    return folder / "s"
+
+
+def _record3d(folder: Path) -> Path:
+    lzfse = importlib.import_module("lzfse")
+    meta = {"K": [30, 0, 0, 0, 30, 0, 12, 8, 1], "w": 24, "h": 16, "dw": 24, "dh": 16, "fps": 60}
+    with zipfile.ZipFile(folder / "s.r3d", "w") as archive:
+        archive.writestr("metadata", json.dumps(meta | {"frameTimestamps": [7.0, 7.5]}))
+        for frame in tiny():
+            assert frame.colour is not None
+            packed = io.BytesIO()
+            Image.fromarray(frame.colour).save(packed, "JPEG")
+            archive.writestr(f"rgbd/{frame.index}.depth", lzfse.compress(frame.depth_m.astype("<f4").tobytes()))
+            archive.writestr(f"rgbd/{frame.index}.conf", lzfse.compress(np.full((16, 24), 2, np.uint8).tobytes()))
+            archive.writestr(f"rgbd/{frame.index}.jpg", packed.getvalue())
+    return folder / "s.r3d"
+
+
+def _stray(folder: Path) -> Path:
+    for frame in tiny():
+        image_folders.save(folder / "s" / "depth" / f"{frame.index}.png", image_folders.raw_depth(frame, 1.0))
+        image_folders.save(folder / "s" / "confidence" / f"{frame.index}.png", np.full((16, 24), 2, np.uint8))
+    (folder / "s" / "camera_matrix.csv").write_text("30.0, 0.0, 12.0\n0.0, 30.0, 8.0\n0.0, 0.0, 1.0\n")
+    return folder / "s"
+
+
+def _depth_as(suffix: str) -> Callable[[Path], Path]:
+    """Return what writes depth in m, or of PGM in mm, as files of a kind."""
+
+    def make(folder: Path) -> Path:
+        inner = folder / "s" / "depth"
+        inner.mkdir(parents=True)
+        for frame in tiny():
+            path, depth_m = inner / f"{frame.index}{suffix}", np.nan_to_num(frame.depth_m)
+            match suffix:
+                case ".npy":
+                    np.save(path, depth_m)
+                case ".npz":
+                    np.savez_compressed(path, depth=depth_m)
+                case ".exr":
+                    openexr = importlib.import_module("OpenEXR")
+                    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+                    openexr.File(header, {"Z": depth_m}).write(str(path))
+                case _:
+                    pixels = np.rint(1000.0 * depth_m).astype(">u2").tobytes()
+                    path.write_bytes(b"P5\n24 16\n65535\n" + pixels)
+        (folder / "s" / "camera.json").write_text('{"fx": 30, "fy": 30.5, "cx": 11.5, "cy": 7.5}')
+        return folder / "s"
+
+    return make
+
+
+_OPENCV: Final = """%YAML:1.0
+---
+image_width: 24
+image_height: 16
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [30., 0., 11.5, 0., 30.5, 7.5, 0., 0., 1.]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [0.1, -0.02, 0.001, 0.002, 0.]
+"""
+_CAMERA_INFO: Final = """width: 24
+height: 16
+distortion_model: plumb_bob
+d: [0.1, -0.02, 0.001, 0.002, 0.0]
+k: [30.0, 0.0, 11.5, 0.0, 30.5, 7.5, 0.0, 0.0, 1.0]
+"""
 
 
 def _robot(folder: Path) -> Path:
@@ -270,6 +370,15 @@ TARGETS |= {
         _intrinsics("camera.json", '{"K": [[30, 0, 11.5], [0, 30.5, 7.5], [0, 0, 1]]}'), ("s/*.json",), read_all
     ),
     "plain": Target(_intrinsics("intrinsics.txt", "30 30.5 11.5 7.5\n"), ("s/*.txt",), read_all, 0.5),
+    "opencv": Target(_intrinsics("camera.yaml", _OPENCV), ("s/*.yaml",), read_all),
+    "camera_info": Target(_intrinsics("camera_info.yaml", _CAMERA_INFO), ("s/*.yaml",), read_all),
+    "nerfstudio": Target(_listed, ("s/transforms.json",), read_all, 2.0),
+    "record3d": Target(_record3d, ("s.r3d",), read_all),
+    "stray scanner": Target(_stray, ("s/camera_matrix.csv", "s/confidence/*"), read_all),
+    "npy": Target(_depth_as(".npy"), ("s/depth/*",), read_all),
+    "npz": Target(_depth_as(".npz"), ("s/depth/*",), read_all),
+    "exr": Target(_depth_as(".exr"), ("s/depth/*",), read_all),
+    "pgm": Target(_depth_as(".pgm"), ("s/depth/*",), read_all),
     "robot": Target(_robot, ("robot.txt",), trajectory),
     "recipe": Target(_recipe, ("s.json",), load_recipe),
     "run": Target(_report, ("report.json",), _poses),
