@@ -241,6 +241,26 @@ def test_options_that_cannot_be_used_are_refused_in_a_line(cli: Run, tmp_path: P
     assert sorted(path.name for path in folder.iterdir()) == ["given.json"]
 
 
+LAGGING = """
+import os, threading
+from concurrent.futures import Future, Executor
+
+
+class Lagging(Executor):  # what a machine elsewhere wrote is seen here a second later than it says so
+    def submit(self, run, job):
+        ended, note = Future(), job.note
+        result = run(job)
+        os.rename(note, f"{note}.hidden")
+        threading.Timer(1.0, os.rename, (f"{note}.hidden", note)).start()
+        ended.set_result(result)
+        return ended
+
+
+def make(workers):
+    return Lagging()
+"""
+
+
 def test_an_executor_of_ones_own_is_a_callable(cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, out = sequence(tmp_path / "s"), tmp_path / "out"
     (tmp_path / "my_engine.py").write_text(
@@ -251,6 +271,11 @@ def test_an_executor_of_ones_own_is_a_callable(cli: Run, tmp_path: Path, monkeyp
     monkeypatch.syspath_prepend(tmp_path)
     assert cli("batch", folder, "--out", out, "--executor", "my_engine:make").status == 0
     assert len(book(out)) == 3
+    (tmp_path / "my_engine.py").write_text(LAGGING)
+    sys.modules.pop("my_engine")
+    late = sequence(tmp_path / "late")
+    assert cli("batch", late, "--out", out, "--executor", "my_engine:make").status == 0
+    assert {name: row["status"] for name, row in rows(out).items()} == {"s": 0, "late": 0}
     (tmp_path / "my_engine.py").write_text("def make(workers):\n    return workers\n")
     sys.modules.pop("my_engine")
     ended = cli("batch", folder, sequence(tmp_path / "t"), "--out", out, "--executor", "my_engine:make")

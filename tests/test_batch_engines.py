@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from command_runner import QUICK
-from fake_builder import book, sequence, started, wait_for
+from fake_builder import BOOK, book, sequence, started, wait_for
 
 from modeler.batch.models import TABLE
 from modeler.export.models_table import read_table
@@ -155,6 +156,21 @@ def test_a_scheduler_that_is_not_there_is_said_in_a_line(tmp_path: Path, monkeyp
         said = batch.communicate(timeout=120.0)[1]
         assert (batch.returncode, said.count("\n")) == (2, 1), said
         assert "no scheduler answers there" in said
+
+
+@with_submitit
+def test_a_job_of_submitit_that_is_killed_loses_a_pair_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HERE.parent), str(HERE)]))
+    (tmp_path / "sitecustomize.py").write_text("from modeler.batch import jobs; jobs.BUILDER = 'fake_builder'")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ["PYTHONPATH"]]))
+    out, jobs = tmp_path / "out", tmp_path / "jobs"
+    batch = started(*sequences(tmp_path, 0.3), "--out", out, "--executor", f"slurm:{jobs}", "--workers", "2")
+    wait_for(lambda: book(out))
+    first = int((out / BOOK).read_text().split()[2])
+    os.kill(int(Path(f"/proc/{first}/stat").read_text().rpartition(")")[2].split()[1]), signal.SIGKILL)
+    said = batch.communicate(timeout=240.0)[1]
+    assert batch.returncode == 0, said
+    check_book(out, 2)
 
 
 @with_submitit

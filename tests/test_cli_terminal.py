@@ -293,6 +293,13 @@ def test_too_few_files_are_said_in_one_line() -> None:
     assert "ulimit -n" in ended.stderr
 
 
+@pytest.mark.parametrize("words", ["info LONG", "report LONG", "build BOX --out LONG", "batch BOX --out LONG"])
+def test_paths_longer_than_the_system_takes_are_refused(words: str, capfd: pytest.CaptureFixture[str]) -> None:
+    long = "/".join(["folder"] * 700)
+    assert main([{"LONG": long, "BOX": BOX}.get(word, word) for word in words.split()]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+
+
 def test_numbers_of_thousands_of_digits_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["build", BOX, "--out", str(tmp_path / "run"), "--frames", "0:" + "9" * 5000]) == 2
     assert capfd.readouterr().err.count("\n") == 1

@@ -1,10 +1,13 @@
 """Concurrent work gives the same results in the same order, whatever the number of threads."""
 
+import multiprocessing
 import threading
 import time
 
 import pytest
 
+from modeler.cli import main
+from modeler.sequences import bundled
 from modeler.system import concurrency
 from modeler.system.concurrency import in_background, in_parallel, parallel_map, prefetching
 
@@ -117,3 +120,12 @@ def test_a_parallel_map_keeps_the_order_and_does_not_start_the_rest_once_closed(
     assert made[0] == 0
     assert len(made) <= (1 if threads == 1 else 3)
     assert list(parallel_map(make, range(4))) == [0, -1, -2, -3]
+
+
+@pytest.mark.parametrize("method", ["spawn", "forkserver", "fork"])
+def test_processes_register_however_they_are_started(method: str) -> None:
+    """Also where this process has registered before, and runs threads."""
+    command = ["register", str(bundled("box")), "0", "1", "--prior", "table", "--method", "icp"]
+    assert main(command) == 0
+    with multiprocessing.get_context(method).Pool(1) as pool:
+        assert pool.apply_async(main, [command]).get(120.0) == 0

@@ -9,11 +9,12 @@ from concurrent.futures import CancelledError, Executor, Future
 from queue import SimpleQueue
 
 from modeler.batch.engines import engine
-from modeler.batch.jobs import PROCESSES, TRIES, Ended, Job, run, write_failure
+from modeler.batch.jobs import PROCESSES, TRIES, Ended, Job, read_note, run, write_failure
 from modeler.types import InputError
 
 _LOSSES = 3  # how often an engine may lose a job
 _RETURNS_S = 120.0  # time to wait for a lost engine
+_LAGS_S = 60.0  # that a shared disk may show what other machines wrote: NFS keeps folders for so long (acdirmax)
 
 
 def results(
@@ -79,5 +80,13 @@ def _until_lost(executor: Executor, waiting: dict[str, Job], losses: Counter[str
         if one.status not in (0, 3) and one.tries < TRIES:
             submit(job)
             continue
+        _await_note(job, one)
         del waiting[job.name]
         yield one
+
+
+def _await_note(job: Job, one: Ended) -> None:
+    """Wait until the state that a job wrote, perhaps elsewhere, is seen here, from where models are listed."""
+    given_up_s = time.monotonic() + _LAGS_S
+    while read_note(job.note).get("status") != one.status and time.monotonic() < given_up_s:
+        time.sleep(0.2)
