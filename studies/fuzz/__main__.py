@@ -78,7 +78,7 @@ def one(name: str, count: int, seed: int) -> int:
     resource.setrlimit(resource.RLIMIT_AS, (MAX_BYTES, MAX_BYTES))
     signal.signal(signal.SIGALRM, _late)
     signal.signal(signal.SIGPROF, _late)
-    target, rng = TARGETS[name], np.random.default_rng([seed, list(TARGETS).index(name)])
+    target, rng = TARGETS[name], np.random.default_rng([seed, *name.encode()])
     shared = Path("/dev/shm")
     folder = Path(tempfile.mkdtemp(prefix="fuzz", dir=shared if shared.is_dir() else None))
     path, files = fresh(target, folder / "in")
