@@ -6,8 +6,10 @@ import asyncio
 import json
 import random
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +23,13 @@ from scipy.spatial.transform import Rotation
 from studio_server import Server, served
 
 from modeler.cli import parsed
-from modeler.sequences import open_sequence, write_bop
+from modeler.sequences import GivenSequence, open_sequence, write_bop
 from modeler.studio.guard import MOST_BYTES, Guard
 from modeler.studio.jobs import Job, Queue
 from modeler.studio.pictures import outline_svg, ring_svg, thumbnail, turns_deg
+from modeler.studio.recorder import Recorder
 from modeler.studio.scan import Scan, Studio, drawn
-from modeler.types import BoolArray, InputError
+from modeler.types import BoolArray, Frame, InputError
 from studies.formats.image_folders import small_frames
 
 PORT = 8080
@@ -259,6 +262,38 @@ def test_a_folder_that_is_being_written_is_followed_and_built_though_it_stalls(t
     assert report is not None
     assert len(report["poses"]) == 4
     assert report["prior"] == "table"
+
+
+def test_views_are_taken_from_a_camera_when_wanted(tmp_path: Path) -> None:
+    frames, more = small_frames(4), threading.Event()
+
+    def images() -> Iterator[Frame]:
+        yield from frames[:3]
+        for number in range(3, 10_000):
+            more.wait(0.02)
+            yield replace(frames[3], index=number)
+
+    recorder = Recorder(GivenSequence.of(images(), live=True), tmp_path / "taken")
+    wait(lambda: recorder.shown > 3)
+    assert recorder.taken == 0
+    for number in (1, 2):
+        recorder.take()
+        wait(lambda number=number: recorder.taken == number)
+    recorder.stop()
+    assert recorder.fault == ""
+    sequence = open_sequence(tmp_path / "taken")
+    assert sequence.indices == (0, 1)
+    view, seen = sequence.frame(1), frames[3]
+    assert np.allclose(np.nan_to_num(view.depth_m), np.nan_to_num(seen.depth_m), atol=2e-4)
+    assert np.array_equal(view.colour, seen.colour)  # type: ignore[arg-type]
+    assert view.camera.fx == pytest.approx(seen.camera.fx)
+
+
+def test_a_camera_that_is_not_there_is_told_and_nothing_is_begun(tmp_path: Path) -> None:
+    studio = Studio(tmp_path / "studio")
+    with pytest.raises(InputError, match=r"realsense|pyrealsense2"):
+        studio.record("realsense:", None, None)
+    assert (studio.capture, studio.recorder, studio.folders()) == (None, None, [])
 
 
 def wait(until: Callable[[], bool]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
 from nicegui import run, ui
 
 from modeler.studio.capture import Capture
+from modeler.studio.jobs import Job
 from modeler.studio.pictures import outline_svg, ring_svg
 from modeler.studio.widgets import (
     PRIORS,
@@ -26,6 +28,14 @@ if TYPE_CHECKING:
     from modeler.studio.page import Page
 
 _LATE_S: Final = 15.0  # without a frame: longer than a person takes to turn an object by hand
+_FOLDER: Final = ""
+_CAMERAS: Final = {
+    "realsense:": "Intel RealSense",
+    "orbbec:": "Orbbec Femto, Gemini, Astra",
+    "oak:": "OAK-D",
+    "azure:": "Azure Kinect",
+}
+"""Connected cameras, by the names under which sequences open them."""
 _BEAT_S: Final = 5.0  # of the metronome, to begin with
 _TICK_HZ, _PLACED_HZ, _LOST_HZ = 880, 660, 220  # notes that are told apart
 TONE: Final = """<script>
@@ -60,8 +70,8 @@ class CaptureStep:
                 with div("card"):
                     heading("Take a capture")
                     quiet(
-                        "Have a camera program write depth images into a folder, turn the object a little between two "
-                        "frames, and watch the model grow."
+                        "Start a connected camera, or have a program write depth images into a folder; turn the "
+                        "object a little between two views, and watch the model grow."
                     )
                     self._choices()
                 with div("card") as self.light:
@@ -71,7 +81,10 @@ class CaptureStep:
                 self.line = command_line()
 
     def _choices(self) -> None:
+        source = ui.select({_FOLDER: "A folder that is written", **_CAMERAS}, value=_FOLDER, label="From")
+        source.classes("w-full").props("dense")
         folder = ui.input("Folder", value=str(self.page.files.place)).classes("w-full").props("dense outlined")
+        folder.bind_visibility_from(source, "value", value=_FOLDER)
         moves = {name: label for name, (label, *_) in PRIORS.items() if name != "held"}
         prior = ui.select(moves, value="auto", label="How does it move?").classes("w-full").props("dense")
         with ui.row().classes("no-wrap items-center"):
@@ -84,36 +97,49 @@ class CaptureStep:
 
         async def watch() -> None:
             chosen = None if prior.value == "auto" else prior.value
-            await self._watch(Path(folder.value or "."), chosen, step.value if chosen == "turntable" else None)
+            given = (chosen, step.value if chosen == "turntable" else None)
+            place = Path(folder.value or ".").expanduser()
+            if source.value == _FOLDER:
+                await self._start(lambda: self.page.studio.watch(place, *given))
+            else:
+                await self._start(lambda: self.page.studio.record(str(source.value), *given))
 
-        main_button("Watch the folder", watch)
+        main_button("Start", watch)
+        self.taking = main_button("Take this view (T)", self.take)
 
-    async def _watch(self, folder: Path, prior: str | None, step_deg: float | None) -> None:
-        """Follow a folder that is being written."""
+    def take(self) -> None:
+        """Take the view that the camera sees now."""
+        if self.page.studio.recorder is not None:
+            self.page.studio.recorder.take()
+
+    async def _start(self, begin: Callable[[], list[Job]]) -> None:
+        """Begin a capture."""
         if self.page.busy():
             return
         try:
-            jobs = await run.io_bound(self.page.studio.watch, folder.expanduser(), prior, step_deg) or []
-            await self.page.run(jobs)
+            await self.page.run(await run.io_bound(begin) or [])
         except InputError as error:
             complain(error)
 
     def follow(self) -> None:
         """Show what has come."""
-        capture = self.page.studio.capture
+        capture, recorder = self.page.studio.capture, self.page.studio.recorder
+        self.taking.set_visibility(recorder is not None)
         if capture is None or self.page.step != "Capture":
             return
         placed, words = capture.said()
         self.come.text = _come(capture, placed, words)
         self.line.text = capture.job.line
-        lines = [*capture.doubts(), *capture.facts(), capture.next()]
+        if recorder is not None:
+            self.live.set_source(f"/capture/newest.jpg?v={recorder.shown}")
+        lines = [*([] if recorder is None else [recorder.fault]), *capture.doubts(), *capture.facts(), capture.next()]
         self.more.text = "\n".join(filter(None, map(sentence, lines)))
         shown = f"{capture.count} {words} {capture.next()}"
         if shown == self._shown:
             return
         self._shown = shown
         self.light.classes(replace=f"card {'' if placed is None else 'good' if placed else 'bad'}")
-        if capture.count:
+        if capture.count and recorder is None:
             self.live.set_source(f"/capture/newest.jpg?v={capture.count}")
             self.live.set_content(outline_svg(capture.mask))
         if (report := capture.report()) is not None:

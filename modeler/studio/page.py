@@ -168,15 +168,14 @@ class Page:
 
     def _captured(self, capture: Capture) -> None:
         """Go on with a capture of which the model has been made."""
-        capture.stop()
-        self.studio.capture = None
+        self.studio.release()
         try:
             self.studio.open(capture.folder)
         except InputError as error:
             complain(error)
 
     async def _key(self, event: events.KeyEventArguments) -> None:
-        """Turn frames with the arrow keys, choose steps with the digits, and build with B."""
+        """Turn frames with the arrow keys, choose steps with the digits, build with B, take views with T."""
         held = event.modifiers
         if not event.action.keydown or held.ctrl or held.alt or held.meta:
             return
@@ -187,3 +186,5 @@ class Page:
             self.object.turn(1 if name == "ArrowRight" else -1)
         elif self.step == "Build" and name == "b":
             await self.building.build()
+        elif self.step == "Capture" and name == "t":
+            self.capturing.take()

@@ -26,6 +26,7 @@ from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import AbstractSequence, KeptSequence, finest_unit_mm, open_sequence, scene_meta, write_bop
 from modeler.studio.capture import IDLE_S, Capture
 from modeler.studio.jobs import Job, Queue
+from modeler.studio.recorder import Recorder
 from modeler.system.regular_files import read_regular
 from modeler.types import BoolArray, InputError, Outcome, Segmentation
 
@@ -497,6 +498,8 @@ class Studio:
         """The scan that pages show."""
         self.capture: Capture | None = None
         """The folder that is being written."""
+        self.recorder: Recorder | None = None
+        """The camera that writes it, if it is ours."""
         self.version = 0
         """Grows where pages must be drawn anew."""
         self._scans: dict[Path, Scan] = {}
@@ -533,6 +536,33 @@ class Studio:
             self.capture.stop()
         self.capture = Capture(folder, job)
         return [job, page_job(run)]
+
+    def record(self, camera: str, prior: str | None, step_deg: float | None) -> list[Job]:
+        """Build from the views that a person takes with a connected camera.
+
+        Args:
+            camera: such as `realsense:`.
+            prior: name of the motion prior; None: auto.
+            step_deg: turn from view to view (turntable).
+
+        Raises:
+            InputError: if the camera cannot be had.
+        """
+        self.release()
+        sequence = open_sequence(camera)
+        stem = camera.partition(":")[0]
+        names = (self.out / "taken" / f"{stem}-{number}" for number in range(1, 10_000))
+        self.recorder = Recorder(sequence, next(name for name in names if not name.exists()))
+        self.recorder.folder.mkdir(parents=True)
+        return self.watch(self.recorder.folder, prior, step_deg)
+
+    def release(self) -> None:
+        """Let go of camera and folder."""
+        if self.recorder is not None:
+            self.recorder.stop()
+        if self.capture is not None:
+            self.capture.stop()
+        self.capture = self.recorder = None
 
     def _chosen(self, sequence: Path) -> tuple[Path, Choices]:
         """Return the folder and the choices of the scan of a capture, or those of a new one.

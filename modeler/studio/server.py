@@ -135,8 +135,7 @@ def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
         uvicorn.Server(config).run(sockets=[listening])
     finally:
         studio.queue.stop()
-        if studio.capture is not None:
-            studio.capture.stop()
+        studio.release()
         viewers.stop()
 
 
@@ -177,7 +176,8 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
 
     @app.get("/capture/newest.jpg")
     def newest() -> Response:
-        frame = None if studio.capture is None else studio.capture.frame
+        source = studio.recorder or studio.capture
+        frame = None if source is None else source.frame
         return Response(status_code=404) if frame is None else _picture(jpeg(frame))
 
     @app.get("/models/{name}/{run}.jpg")

@@ -1,0 +1,85 @@
+"""A connected camera: shown as it sees, and recorded view by view, when a person says so."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+from pathlib import Path
+from typing import Final, final
+
+import numpy as np
+from PIL import Image
+
+from modeler.export import write_atomically
+from modeler.sequences import AbstractSequence, finest_unit_mm
+from modeler.types import Frame, InputError
+
+REACH_M: Final = 16.0
+"""Depth beyond is a measurement error, as in `modeler convert`; what lies there fits no 16 bits of a fine unit."""
+
+
+@final
+class Recorder:
+    """Takes the images of a camera from a thread of its own, and writes those that are wanted into a folder."""
+
+    def __init__(self, camera: AbstractSequence, folder: Path) -> None:
+        """Begin to look through a camera; `folder` will hold the views, as `modeler build --watch` reads them."""
+        self.folder = folder
+        self.frame: Frame | None = None
+        """The newest image."""
+        self.shown = 0
+        """Number of images so far."""
+        self.taken = 0
+        """Number of views in the folder."""
+        self.fault = ""
+        """Why no more images come."""
+        self._camera = camera
+        self._wanted, self._stopped = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._follow, daemon=True, name="camera")
+        self._thread.start()
+
+    def take(self) -> None:
+        """Keep the next image."""
+        self._wanted.set()
+
+    def stop(self) -> None:
+        """Let go of the camera."""
+        self._stopped.set()
+        self._thread.join()
+
+    def _follow(self) -> None:
+        try:
+            for frame in self._camera.until(self._stopped.is_set):
+                self.frame = frame
+                self.shown += 1
+                if self._wanted.is_set():
+                    self._wanted.clear()
+                    self._write(frame)
+                if self._stopped.is_set():
+                    return
+        except InputError as error:
+            self.fault = str(error)
+
+    def _write(self, frame: Frame) -> None:
+        """Write a view: depth last, with which it is complete.
+
+        Raises:
+            InputError: if a file cannot be written.
+        """
+        name, camera, unit_mm = f"{self.taken:06d}.png", frame.camera, finest_unit_mm(REACH_M)
+        if not self.taken:
+            known = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "depth_scale": unit_mm}
+            write_atomically(self.folder / "camera.json", json.dumps(known) + "\n")
+        if frame.colour is not None:
+            write_atomically(self.folder / "rgb" / name, _png(frame.colour))
+        near_m = np.where((frame.depth_m > 0.0) & (frame.depth_m < REACH_M), frame.depth_m, 0.0)
+        depth = np.rint(near_m * (1000.0 / unit_mm)).astype(np.uint16)
+        write_atomically(self.folder / "depth" / name, _png(depth))
+        self.taken += 1
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", compress_level=1)
+    return buffer.getvalue()
