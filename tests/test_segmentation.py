@@ -11,8 +11,16 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from segmentation_worlds import CAMERA, OBJECT, World, iou
 
-from modeler.segmentation import Scene, Segmenter
-from modeler.segmentation.depth_images import edge_of, mixed_pixels, pieces, voxel_clusters, without_specks
+from modeler.segmentation import DepthNoise, Scene, Segmenter
+from modeler.segmentation.depth_images import (
+    edge_of,
+    mixed_pixels,
+    noise_ratio,
+    noise_within,
+    pieces,
+    voxel_clusters,
+    without_specks,
+)
 from modeler.sequences.bop import BopSequence
 from modeler.types import Camera, Frame, Outcome
 
@@ -543,3 +551,19 @@ def test_real_sequences(name, pixels, object_px):
         assert one.outcome is Outcome.CONVERGED
         assert pixels[0] < np.count_nonzero(one.mask) < pixels[1]
         assert np.abs(np.argwhere(one.mask).mean(axis=0)[::-1] - object_px).max() < 60.0
+
+
+def test_noise_of_a_camera_that_stands_still_is_as_large_within_frames_as_between_them(
+    rng: np.random.Generator,
+) -> None:
+    camera, noise = Camera(160, 120, 150.0, 150.0, 79.5, 59.5), DepthNoise()
+    tilted_m = 0.6 + 0.001 * np.arange(160) + np.zeros((120, 1))
+    still = [(tilted_m + rng.normal(0.0, 0.008, tilted_m.shape)).astype(np.float32) for _ in range(9)]
+    moving = [
+        (tilted_m + 0.015 * k + rng.normal(0.0, 0.001, tilted_m.shape)).astype(np.float32) for k in rng.permutation(9)
+    ]
+    assert 0.5 < noise_ratio(still, camera, noise) / noise_within(still, camera, noise) < 1.5
+    assert noise_ratio(moving, camera, noise) / noise_within(moving, camera, noise) > 4.0
+    noisier = noise.times(6.0, 0.7)
+    assert noisier.sigma_m(np.array(0.7)) == pytest.approx(6.0 * noise.sigma_m(np.array(0.7)))
+    assert noisier.sigma_m(np.array(0.2)) < 2.0 * noise.sigma_m(np.array(0.2))

@@ -19,6 +19,7 @@ LEAST_PIECE = 0.07  # of the largest: noise along edges, and false depth around 
 STRAY_WEIGHT = 0.2  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
 HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an image that shows an object alone
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
+_APART_PX = 4  # of the downsampled image: blocks that stereo matches are as wide
 _OUTLIERS_IN = 7  # one measurement in this many may be false; where more lie before the background, something moved
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
 Labels = npt.NDArray[np.int32]
@@ -50,9 +51,10 @@ class DepthNoise:
         """Return the difference beyond which two measurements at `depth_m` are two surfaces: 3 sigma plus a floor."""
         return 3.0 * self.sigma_m(depth_m) + self.floor_m
 
-    def times(self, factor: float) -> DepthNoise:
-        """Return the noise scaled by a factor."""
-        return DepthNoise(factor * self.floor_m, factor * self.quadratic_per_m)
+    def times(self, factor: float, depth_m: float) -> DepthNoise:
+        """Return the noise that is larger by a factor of at least 1 at a depth: the part that grows with depth is."""
+        whole_m = factor * float(self.sigma_m(np.array(depth_m)))
+        return DepthNoise(self.floor_m, float(np.sqrt(max(whole_m**2 - self.floor_m**2, 0.0))) / depth_m**2)
 
 
 @final
@@ -147,6 +149,28 @@ def noise_ratio(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNo
     low, middle, high = (np.take_along_axis(stack, place[None], axis=0)[0][often] for place in quarters)
     apart = 2.0 * ndtri(0.75)  # standard deviations from the lower to the upper quartile of a Gaussian
     return float(np.median((high - low) / (apart * noise.sigma_m(middle))))
+
+
+def noise_within(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
+    """Return the ratio of the depth's noise within single images to `noise`: the median over all pixels.
+
+    Second differences along rows are free of planes; those of pixels some way apart, of noise that neighbours share.
+
+    Args:
+        depths_m: (n of (h, w), NaN = no measurement).
+        camera: the camera.
+        noise: what is expected of it.
+    """
+    stride, ratios = planning_stride(camera), []
+    for whole_m in depths_m:
+        depth_m = whole_m[::stride, ::stride]
+        left, middle, right = (
+            depth_m[:, k : depth_m.shape[1] - 2 * _APART_PX + k] for k in (0, _APART_PX, 2 * _APART_PX)
+        )
+        bent = np.abs(left - 2.0 * middle + right) / noise.sigma_m(middle)
+        ratios.append(bent[np.isfinite(bent)])
+    bent = np.concatenate(ratios)
+    return float(np.median(bent) / (np.sqrt(6.0) * ndtri(0.75))) if len(bent) else 1.0
 
 
 def _sorted(depths_m: Sequence[Float32Array], stride: int) -> tuple[Float32Array, npt.NDArray[np.int64]]:

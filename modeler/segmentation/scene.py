@@ -162,6 +162,7 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     near = ((layers.front_m > low - margin) & (layers.front_m < high + margin)).all(axis=-1)
     elsewhere = _central(np.where(near, 0, labels), depth, layers.front_share)
     elsewhere[cut[: len(elsewhere)]] *= STRAY_WEIGHT
+    elsewhere[elsewhere <= LEAST_PIECE * merit.max()] = 0.0  # specks of noise are no other object, however many
     regions = np.zeros(depth.shape, dtype=np.int32)
     ndimage.label(layers.moved & allowed & near, output=regions)
     merit_of = _central(regions, depth, layers.front_share)

@@ -13,6 +13,7 @@ from modeler.segmentation.depth_images import (
     MOST,
     DepthNoise,
     noise_ratio,
+    noise_within,
     planning_stride,
     point_image,
     separate_layers,
@@ -21,12 +22,15 @@ from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, neare
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
 from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
-from modeler.views.range_noise import range_noise
+from modeler.views.range_noise import RangeNoise, range_noise
 from modeler.views.sparsity import closed, gap_px, interpolated, measured_share
 
 _NOISIEST = 4.2
 """Largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves: between 3.0 of a
 first Kinect at 2 to 3 m and 5.7 of a camera moved by hand, 27 of one in large steps."""
+_CHANGES = 2.0
+"""Largest ratio of the spread from frame to frame to the noise within frames, where this is large: noise of a camera
+that stands still is the same in both to its fixed pattern, which only lowers it."""
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 
@@ -118,7 +122,7 @@ class Segmenter:
             mask = frame.mask & self._allowed(frame.depth_m)
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
-            loose = plane is not None and self._share_on(plane, frame, mask) > _LOOSE_SHARE
+            loose = plane is not None and self._share_on(plane, frame, mask, scene.range_noise) > _LOOSE_SHARE
             outcome = Outcome.UNSURE_MASK if loose else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
@@ -156,9 +160,9 @@ class Segmenter:
         layers, noisier = separate_layers(depths_m, camera, noise), None
         if layers.changes_widely:
             factor = noise_ratio(depths_m, camera, noise)
-            if factor > _NOISIEST:
+            if factor > max(_NOISIEST, _CHANGES * noise_within(depths_m, camera, noise)):
                 return Scene(camera_moves=True)
-            noisier = noise = noise.times(factor)
+            noisier = noise = noise.times(max(factor, 1.0), float(np.nanmedian(depths_m)))
             layers = separate_layers(depths_m, camera, noise)
         if layers.camera_moves:
             return Scene(camera_moves=True)
@@ -198,12 +202,13 @@ class Segmenter:
         agreeing = np.count_nonzero(np.abs(off) < 2.0 * (scene.noise or self.noise).tolerance_m(depth))
         return bool(agreeing >= MOST * np.count_nonzero(np.isfinite(off)))
 
-    def _share_on(self, plane: Plane, frame: Frame, mask: BoolArray) -> float:
-        """Return the share of a mask's measured pixels that lie on the support plane."""
+    def _share_on(self, plane: Plane, frame: Frame, mask: BoolArray, seen: RangeNoise | None) -> float:
+        """Return the share of a mask's measured pixels that lie on the support plane, by the noise that planes show."""
+        noise = self.noise if seen is None else DepthNoise(0.0, seen.pixel_sigma_inverse_per_m)
         stride = planning_stride(frame.camera)
         points = _points(frame, stride)
         points = points[mask[::stride, ::stride] & np.isfinite(points[..., 2])].astype(np.float64)
-        return float(np.mean(np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[:, 2])))
+        return float(np.mean(np.abs(plane.height_m(points)) < noise.tolerance_m(points[:, 2])))
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
         """Return the support plane around a masked object, if one is seen."""
