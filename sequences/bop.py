@@ -303,7 +303,7 @@ def scene_meta(sequence: AbstractSequence) -> dict[str, object]:
     meta: dict[str, object] = {"name": sequence.name}
     noise, motion = sequence.sensor(), sequence.motion
     if noise is not None:
-        meta["sensor"] = noise._asdict()
+        meta["sensor"] = {name: value for name, value in noise._asdict().items() if value is not None}
     if motion is not None:
         meta["motion"] = dict(motion)
     return meta

@@ -14,7 +14,7 @@ import numpy as np
 
 from modeler.sequences.base import AbstractDerived
 from modeler.sequences.input_files import Node, read_tree
-from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Array, Frame, InputError, SensorNoise
+from modeler.types import NOMINAL_FOCAL, Array, Frame, InputError, SensorNoise
 
 MAX_ANGLE_RAD = np.radians(85.0)
 """Beyond, the model's noise would grow without bounds and is kept constant."""
@@ -121,9 +121,9 @@ class CalibratedSequence(AbstractDerived):
     def sensor(self) -> SensorNoise:
         """Return the noise at the distance of the object in the first frame."""
         said = self.whole.sensor()
-        shift_px = COLOUR_SHIFT_PX if said is None else said.sigma_colour_px
-        sigma_focal = NOMINAL_FOCAL if said is None else said.sigma_focal
-        return SensorNoise(*self._at_object, shift_px, sigma_focal)
+        sigma_wh, sigma_r_m = self._at_object
+        known = SensorNoise(sigma_focal=NOMINAL_FOCAL) if said is None else said
+        return known._replace(sigma_wh=sigma_wh, sigma_r_m=sigma_r_m)
 
     def select(self, every: int = 1, frames: slice | None = None) -> CalibratedSequence:
         """Return a part of the sequence."""

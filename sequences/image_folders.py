@@ -99,6 +99,16 @@ class ImageFolderSequence(AbstractRecording):
         _ = self.name, self.sensor(), self.motion
 
     @property
+    def calibrated(self) -> bool:
+        """Whether the intrinsics are of a calibration of this camera."""
+        return self.camera.calibrated
+
+    @property
+    def kind(self) -> str | None:
+        """Kind of the depth camera, where the files are those of a phone."""
+        return "tof" if self.camera.of_phone else None
+
+    @property
     def indices(self) -> tuple[int, ...]:
         """Frame numbers, ascending."""
         return tuple(self.files)

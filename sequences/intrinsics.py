@@ -78,8 +78,10 @@ NAMES = (
     "metadata",
 )
 """Files that are looked for, in this order; after them, files of YAML (OpenCV, ROS, ORB-SLAM, Kalibr)."""
-OF_COLOUR = ("camera_matrix.csv", "transforms.json", "metadata.json", "metadata", "cameras/")
-"""Of phones: intrinsics of colour images, whose view depth has in fewer pixels."""
+OF_PHONES = ("camera_matrix.csv", "metadata.json", "metadata", "cameras/")
+"""Of Stray Scanner, Record3D and Polycam."""
+OF_COLOUR = (*OF_PHONES, "transforms.json")
+"""Intrinsics of colour images, whose view depth has in fewer pixels."""
 _PHONE_SIZE = (1920, 1440)
 """Images of Stray Scanner, whose file does not state their size."""
 
@@ -101,6 +103,16 @@ class CameraFacts:
     """Coefficients of the lens, in the order of the model."""
     model: str = ""
     """Name of the distortion model; "" if the file states none."""
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether a calibration wrote it, which states the lens as well, or a phone."""
+        return bool(self.distortion or self.model) or self.of_phone
+
+    @property
+    def of_phone(self) -> bool:
+        """Whether a program of phones wrote it; their depth is by time of flight."""
+        return self.by in OF_PHONES
 
     def lens(self, size: tuple[int, int]) -> Lens:
         """Return the camera, with its lens, for images of (width, height).

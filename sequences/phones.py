@@ -36,6 +36,18 @@ class Record3DSequence(AbstractRecording):
     """Of the depth images."""
     times_s: tuple[float, ...]
     """By frame number, from 0."""
+    by_maker: bool = True
+    """Whether the intrinsics are the recording's, not the user's."""
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the intrinsics are of a calibration of this camera."""
+        return self.by_maker
+
+    @property
+    def kind(self) -> str:
+        """Kind of the depth camera."""
+        return "tof"
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -127,7 +139,7 @@ def open_record3d(path: Path, overrides: Overrides) -> Record3DSequence:
     times_s = [float(index) / (30.0 if rate is None else rate.number(1e-3, 1e4)) for index in range(count)]
     if stamps is not None and len(stamps.elements()) == count:
         times_s = [stamp.number() for stamp in stamps.elements()]
-    return Record3DSequence(path, Camera(width, height, *intrinsics), tuple(times_s))
+    return Record3DSequence(path, Camera(width, height, *intrinsics), tuple(times_s), overrides.intrinsics is None)
 
 
 def images_of_transforms(path: Path) -> FoundImages | None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Generic, TypeVar, final
+from typing import Final, Generic, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,16 @@ import numpy.typing as npt
 from modeler.sequences.base import AbstractSequence, span
 from modeler.sequences.input_files import Node, is_there, read_tree
 from modeler.sequences.lens import Lens
-from modeler.types import COLOUR_SHIFT_PX, NOMINAL_FOCAL, Frame, InputError, SensorNoise
+from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, Frame, InputError, SensorNoise
+
+_SENSOR: Final = {
+    "sigma_wh": (1e-9, 1.0),
+    "sigma_r_m": (1e-9, 10.0),
+    "sigma_colour_px": (0.0, 100.0),
+    "sigma_focal": (0.0, 0.2),
+    "sigma_multipath": (0.0, 1.0),
+}
+"""Range of each value of `sensor`."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +49,36 @@ class AbstractRecording(AbstractSequence):
         """The folder or the file."""
         return (self.path,)
 
+    @property
+    def calibrated(self) -> bool:
+        """Whether the intrinsics are of a calibration of this camera, not typed in or nominal."""
+        return False
+
+    @property
+    def kind(self) -> str | None:
+        """Kind of the depth camera, of `MULTIPATH`, where the format tells it."""
+        return None
+
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of the camera from `sequence.json`; None if not given."""
+        """Return the noise of the camera from `sequence.json` and as the format tells it; None if neither says."""
         node = None if self._meta is None else self._meta.get("sensor")
-        if node is None:
-            return None
-        shift = node.get("sigma_colour_px")
-        return SensorNoise(
-            node.need("sigma_wh").number(1e-9, 1.0),
-            node.need("sigma_r_m").number(1e-9, 10.0),
-            COLOUR_SHIFT_PX if shift is None else shift.number(0.0, 100.0),
-            NOMINAL_FOCAL if (focal := node.get("sigma_focal")) is None else focal.number(0.0, 0.2),
+        by_format = SensorNoise(
+            sigma_r_m=None,
+            sigma_focal=CALIBRATED_FOCAL if self.calibrated else NOMINAL_FOCAL,
+            sigma_multipath=0.0 if self.kind is None else MULTIPATH[self.kind],
         )
+        if node is None:
+            return by_format if self.calibrated or self.kind is not None else None
+        kind = node.get("kind")
+        if kind is not None and kind.value not in MULTIPATH:
+            raise kind.fault(f"one of {', '.join(MULTIPATH)}")
+        stated = {name: node.get(name) for name in _SENSOR}
+        values = {name: entry.number(*_SENSOR[name]) for name, entry in stated.items() if entry is not None}
+        if kind is not None:
+            values = {"sigma_multipath": MULTIPATH[str(kind.value)], **values}
+        elif not values:
+            node.need("sigma_r_m")
+        return by_format._replace(**values)
 
     @property
     def motion(self) -> Mapping[str, object] | None:

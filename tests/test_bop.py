@@ -334,7 +334,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "sequence a list": (write(S, b"[]"), "object"),
     "name a number": (edit_json(S, lambda c: c.update(name=3)), "text"),
     "sensor a text": (edit_json(S, lambda c: c.update(sensor="kinect")), "object"),
-    "sensor half": (edit_json(S, lambda c: c["sensor"].pop("sigma_wh")), "sigma_wh"),
+    "sensor half": (edit_json(S, lambda c: c.update(sensor={"sigma": 1e-3})), "sigma_r_m"),
     "sensor negative": (edit_json(S, lambda c: c["sensor"].update(sigma_r_m=-1)), "sigma_r_m"),
     "motion a text": (edit_json(S, lambda c: c.update(motion="table")), "object"),
     "times lack one": (edit_json(S, lambda c: c["timestamps_s"].pop("7")), "frame 7"),

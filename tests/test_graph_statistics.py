@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy import stats
 from slow_cases import sampled
 
 from modeler import se3
-from modeler.graph import PoseGraph, Smoother, shared_noise, solve
+from modeler.graph import PoseGraph, Smoother, shared_noise, solve, variance_factor
 from modeler.graph.covariance import chi_square_quantile
 from modeler.types import Array, Camera, Edge, Frame, PoseGaussian, RayImage, Solution
 from modeler.verdict.spreads import least_uncertain, spread_of_positions, spread_of_rotations
@@ -250,11 +251,33 @@ def test_graph_without_loops_tells_nothing() -> None:
     graph, _ = ring(6, np.random.default_rng(0), [])
     assert shared_noise(graph, solve(graph, {})) == 0.0
     assert shared_noise(PoseGraph(), Solution()) == 0.0
+    assert variance_factor(graph, solve(graph, {}), 0.1) == variance_factor(PoseGraph(), Solution(), 0.1) == 1.0
 
 
 @given(probability=st.floats(1e-6, 1.0 - 1e-6), degrees=st.integers(1, 3000))
 def test_quantiles_are_those_of_scipy(probability: float, degrees: int) -> None:
     assert chi_square_quantile(probability, degrees) == pytest.approx(stats.chi2(degrees).ppf(probability), rel=1e-12)
+
+
+@pytest.mark.parametrize("stated", [1.0, 10.0])
+def test_loops_tell_by_how_much_covariances_are_overstated(stated: float) -> None:
+    factors = []
+    for seed in range(40):
+        graph = _graph(np.random.default_rng(seed), 0.0)
+        edges = [edge(one.target, one.source, replace(one.posterior.pose, covariance=stated * WHOLE), one.kind)
+                 for one in graph.edges]  # fmt: skip
+        graph = PoseGraph(tuple(edges))
+        factors.append(variance_factor(graph, solve(graph, {}), 0.02))
+    assert 0.95 / stated < np.mean(factors) < 1.5 / stated
+    assert variance_factor(graph, solve(graph, {}), 0.5) >= 0.5
+
+
+def test_a_variance_factor_scales_what_edges_say() -> None:
+    graph = _graph(np.random.default_rng(0), 0.3)
+    whole = Smoother(shared=0.3, common=0.1).to(graph).solution
+    part = Smoother(shared=0.3, common=0.1, variance_factor=0.2).to(graph).solution
+    for frame in (1, COUNT - 1):
+        np.testing.assert_allclose(part.covariances[frame], 0.2 * whole.covariances[frame], rtol=1e-9)
 
 
 def test_it_does_not_matter_which_way_round_edges_are_written() -> None:

@@ -130,7 +130,7 @@ def test_a_small_part_that_alone_determines_the_spin_is_not_blurred_away():
     """The lever of a fire extinguisher: coarsely, its views match best 75° off."""
     specimen = load_specimen("fire_extinguisher")
     sequence = RenderedSequence(staged(specimen, Condition(step_deg=40.0), frames=3, seed=1283680154))
-    target, source = viewed([sequence.frame(index) for index in sequence.indices[:2]], "true")
+    target, source = viewed([sequence.frame(index) for index in sequence.indices[:2]], None)
     right, density = true_motion(sequence.truth(), target.index, source.index), TablePrior().between(source, target)
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -141,7 +141,7 @@ def test_a_small_part_that_alone_determines_the_spin_is_not_blurred_away():
 def observed(camera, shape, condition):
     """Source and target of a shape before a depth camera, the true motion, and its density under the table prior."""
     sequence = RenderedSequence(staged(load_specimen(shape), condition, frames=2, seed=1))
-    target, source = viewed(shown(sequence, CAMERAS[camera], np.random.default_rng(1), seed=1), "true")
+    target, source = viewed(shown(sequence, CAMERAS[camera], np.random.default_rng(1), seed=1), CAMERAS[camera])
     truth = true_motion(sequence.truth(), target.index, source.index)
     return source, target, truth, TablePrior().between(source, target)
 

@@ -15,7 +15,7 @@ from modeler.composition.options import default
 
 if TYPE_CHECKING:
     from modeler.sequences import AbstractSequence, Survey
-    from modeler.types import Camera
+    from modeler.types import Camera, SensorNoise
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,7 @@ def rows(sequence: AbstractSequence, found: Survey, doubts: Sequence[str]) -> li
         ("frames", span(found.indices) + timed),
         ("resolution", ", ".join(f"{width} x {height}" for width, height in _sizes(found.cameras)[:4])),
         ("intrinsics", _intrinsics(found.cameras)),
+        ("focal length", _known(sensor)),
         ("depth unit", sequence.depth_unit),
         (
             "depth range",
@@ -135,6 +136,9 @@ def rows(sequence: AbstractSequence, found: Survey, doubts: Sequence[str]) -> li
     if sensor is not None and sensor.sigma_r_m is not None:
         noise = f"{sensor.sigma_wh:.3g} across (w, h), {sensor.sigma_r_m * 1000.0:.3g} mm along the ray"
         lines.append(("sensor noise", noise))
+    if sensor is not None and sensor.sigma_multipath > 0.0:
+        words = f"{sensor.sigma_multipath:.0%} of the object's size (sd), by light from other surfaces: time of flight"
+        lines.append(("smooth errors", words))
     if motion is not None:
         lines.append(("motion", ", ".join(f"{key} {value}" for key, value in motion.items())))
     lines += [("doubt", what) for what in doubts]
@@ -149,6 +153,17 @@ def rows(sequence: AbstractSequence, found: Survey, doubts: Sequence[str]) -> li
 def _sizes(cameras: tuple[Camera, ...]) -> list[tuple[int, int]]:
     """Return (width, height) of the images, each once."""
     return list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
+
+
+def _known(sensor: SensorNoise | None) -> str:
+    """Return how well a focal length is known, and why."""
+    from modeler.types import CALIBRATED_FOCAL, NOMINAL_FOCAL
+
+    sigma_focal = NOMINAL_FOCAL if sensor is None else sensor.sigma_focal
+    if sigma_focal == 0.0:
+        return "exact"
+    source = {NOMINAL_FOCAL: ", as nobody says more", CALIBRATED_FOCAL: ", by a calibration of this camera"}
+    return f"known to {100.0 * sigma_focal:.2g} % (sd){source.get(sigma_focal, '')}"
 
 
 def _intrinsics(cameras: tuple[Camera, ...]) -> str:

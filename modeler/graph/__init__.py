@@ -2,6 +2,7 @@
 
 from modeler.graph.axis import CommonAxis as CommonAxis
 from modeler.graph.covariance import shared_noise as shared_noise
+from modeler.graph.covariance import variance_factor as variance_factor
 from modeler.graph.focal import MovingGraph as MovingGraph
 from modeler.graph.focal import estimate_focal_length as estimate_focal_length
 from modeler.graph.pose_graph import PoseGraph as PoseGraph

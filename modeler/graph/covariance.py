@@ -152,6 +152,8 @@ class SharedCovariance:
     """Estimate of the focal length; None: exact."""
     common_shift_m2: Array | None = None
     """(3, 3) covariance in m², in camera coordinates, of a shift of the surface in all views, added to B; None: 0."""
+    variance_factor: float = 1.0
+    """On the covariances of edges; see `variance_factor`."""
 
     def __call__(self, target: int, source: int) -> Array:
         """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
@@ -166,7 +168,8 @@ class SharedCovariance:
             return independent
         source_from_target = se3.inverse(self.independent.trajectory[source]) @ self.independent.trajectory[target]
         of_target = se3.inverse_covariance(source_from_target, self._noise.get(target, np.zeros((6, 6))))
-        covariance = (1.0 - self.share) * independent + self._noise.get(source, np.zeros((6, 6))) + of_target  # eq. 8.9
+        covariance = self.variance_factor * (1.0 - self.share) * independent
+        covariance = covariance + self._noise.get(source, np.zeros((6, 6))) + of_target  # eq. 8.9
         if self.focal is not None:
             zero = np.zeros(6)  # of frames added since
             apart = self.focal.by_focal.get(source, zero) - self.focal.by_focal.get(target, zero)
@@ -186,8 +189,9 @@ class SharedCovariance:
             to_target = se3.adjoint(se3.inverse(factor.pose.mean))  # ξ of the source frame from one of the target's
             informations.setdefault(factor.source, []).append(information)
             informations.setdefault(factor.target, []).append(to_target.T @ information @ to_target)
+        share = 0.5 * self.variance_factor * self.share
         return {
-            frame: np.asarray(0.5 * self.share * np.linalg.inv(np.mean(some, axis=0)), dtype=np.float64)
+            frame: np.asarray(share * np.linalg.inv(np.mean(some, axis=0)), dtype=np.float64)
             for frame, some in informations.items()
         }
 
@@ -197,13 +201,27 @@ class SharedCovariance:
         covariance = np.zeros((6, 6))
         if self.common:
             informations = [factor.root_information.T @ factor.root_information for factor in self.factors]
-            covariance += self.common * np.linalg.inv(np.mean(informations, axis=0))
+            covariance += self.variance_factor * self.common * np.linalg.inv(np.mean(informations, axis=0))
         if self.common_shift_m2 is not None:
             covariance[3:, 3:] += self.common_shift_m2
         return covariance
 
 
-def shared_noise(graph: PoseGraph, solution: Solution) -> float:
+def variance_factor(graph: PoseGraph, solution: Solution, least: float) -> float:
+    """Return the factor on edges' covariances with which loops are as likely as one of six is to be larger (eq. 8.12).
+
+    Smooth errors of depth are stated as large as they may be; loops show how large they are. It is 1 without loops.
+
+    Args:
+        graph: the edges.
+        solution: of that graph.
+        least: share of the covariances that is not due to smooth errors.
+    """
+    distance, conditions = _distance(graph, solution)
+    return float(np.clip(distance / chi_square_quantile(_QUANTILE, conditions), least, 1.0)) if conditions > 0 else 1.0
+
+
+def shared_noise(graph: PoseGraph, solution: Solution, factor: float = 1.0) -> float:
     """Estimate the fraction ρ of edges' covariances that is noise of their images from the loops' errors (eq. 8.11).
 
     The images' noise cancels around a loop, so that the squared distance over the 6 l conditions of l loops is (1 − ρ)
@@ -213,7 +231,16 @@ def shared_noise(graph: PoseGraph, solution: Solution) -> float:
     Args:
         graph: the edges.
         solution: of that graph.
+        factor: on the edges' covariances: `variance_factor`.
     """
+    distance, conditions = _distance(graph, solution)
+    if conditions <= 0:
+        return 0.0
+    return float(np.clip(1.0 - distance / factor / chi_square_quantile(_QUANTILE, conditions), 0.0, _MAX_SHARE))
+
+
+def _distance(graph: PoseGraph, solution: Solution) -> tuple[float, int]:
+    """Return the squared Mahalanobis distance of the edges from a solution, and the number of conditions of loops."""
     count, distance = 0, 0.0
     for edge in graph.accepted:
         if edge.target not in solution.trajectory or edge.source not in solution.trajectory:
@@ -224,7 +251,4 @@ def shared_noise(graph: PoseGraph, solution: Solution) -> float:
         xi = se3.log(se3.inverse(pose.mean) @ solution.relative(edge.target, edge.source))
         distance += float(xi @ np.linalg.solve(pose.covariance, xi))
         count += 1
-    conditions = 6 * (count - len(solution.trajectory) + 1)
-    if not count or conditions <= 0:
-        return 0.0
-    return float(np.clip(1.0 - distance / chi_square_quantile(_QUANTILE, conditions), 0.0, _MAX_SHARE))
+    return distance, 6 * (count - len(solution.trajectory) + 1) if count else 0

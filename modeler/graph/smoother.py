@@ -58,6 +58,8 @@ class Smoother:
     """Estimate of the focal length, whose uncertainty is added to the covariances; None: exact."""
     common_shift_m2: Array | None = None
     """(3, 3) covariance in m² of a shift of the surface common to all views; see `SharedCovariance`. None: 0."""
+    variance_factor: float = 1.0
+    """On the covariances of edges; see `SharedCovariance`."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """The graph."""
     solution: Solution = field(default_factory=Solution)
@@ -150,6 +152,7 @@ class Smoother:
             mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
             focal=self.focal,
             common_shift_m2=self.common_shift_m2,
+            variance_factor=self.variance_factor,
             camera_from_axis=None if with_axis is None else with_axis.camera_from_axis,
         )
 
@@ -174,9 +177,11 @@ class Smoother:
     def _covariance(self, independent: RelativeCovariance) -> RelativeCovariance | SharedCovariance:
         """Return covariances with the errors that edges share."""
         factors = independent.factors
-        if not (factors and (self.shared or self.common or self.focal or self.common_shift_m2 is not None)):
+        told = self.shared or self.common or self.focal or self.variance_factor != 1.0
+        if not (factors and (told or self.common_shift_m2 is not None)):
             return independent
-        return SharedCovariance(independent, factors, self.shared, self.common, self.focal, self.common_shift_m2)
+        parts = self.shared, self.common, self.focal, self.common_shift_m2, self.variance_factor
+        return SharedCovariance(independent, factors, *parts)
 
     def _with_axis(
         self,

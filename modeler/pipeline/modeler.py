@@ -11,7 +11,7 @@ import numpy as np
 
 from modeler.closure import Closer, Placement
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
-from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise
+from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise, variance_factor
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment
 from modeler.pipeline.pairs import Prepared, Registrations, prepare, without_limits
@@ -437,8 +437,9 @@ class Run:
         solved = partial(state.solved, focal=focal, distance_sigma=distance_sigma)
         axis = self.modeler.prior.shared_axis(list(state.views.values()))
         if axis is None:
-            shared = shared_noise(state.graph, state.solution)
-            self.state = solved(axis=None, shared=shared, common=self.modeler.common_noise)
+            factor = variance_factor(state.graph, state.solution, state.exact_share)
+            shared = shared_noise(state.graph, state.solution, factor)
+            self.state = solved(axis=None, shared=shared, common=self.modeler.common_noise, variance_factor=factor)
         else:
             tilt_rad, shift_m = axis.sigma_tilt_rad, axis.sigma_shift_m
             self.state = solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf))

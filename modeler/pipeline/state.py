@@ -12,6 +12,7 @@ from modeler import se3
 from modeler.closure import MapView, PathNetwork
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
+from modeler.registration.systematic import of_multipath
 from modeler.system.disk_arrays import ViewStore
 from modeler.types import Edge, FocalLength, InputError, PoseGaussian, Posterior, RayImage, Solution
 from modeler.views import Sensor
@@ -198,17 +199,39 @@ class State:
         common: float = 0.0,
         focal: FocalLength | None = None,
         distance_sigma: float = 0.0,
+        variance_factor: float = 1.0,
     ) -> State:
         """Return the state solved with a common axis or shared noise, and a focal length; see `Smoother`.
 
-        `distance_sigma` is the standard deviation of the error of all distances, as a share of that of the surface.
+        `variance_factor` is on the covariances of edges; `distance_sigma` is the standard deviation of the error of all
+        distances, as a share of that of the surface.
         """
         shift = None
-        if distance_sigma > 0.0 and self.views:
+        if self.views:
             middle_m = np.mean([view.centroid_m for view in self.views.values()], axis=0)
-            shift = distance_sigma**2 * np.outer(middle_m, middle_m)
-        smoother = replace(self.smoother, axis=axis, shared=shared, common=common, focal=focal, common_shift_m2=shift)
+            multipath_m = np.sqrt(variance_factor) * np.median([view.multipath_m for view in self.views.values()])
+            sigma = np.hypot(distance_sigma, multipath_m / np.linalg.norm(middle_m))
+            shift = sigma**2 * np.outer(middle_m, middle_m) if sigma > 0.0 else None
+        smoother = replace(
+            self.smoother,
+            axis=axis,
+            shared=shared,
+            common=common,
+            focal=focal,
+            common_shift_m2=shift,
+            variance_factor=variance_factor,
+        )
         return replace(self, smoother=smoother.to(self.graph))
+
+    @property
+    def exact_share(self) -> float:
+        """Mean share of the covariances of edges that is not due to smooth errors of depth."""
+        edges = [edge for edge in self.graph.accepted if edge.source in self.views]
+        shares = [
+            np.trace(np.linalg.solve(edge.posterior.pose.covariance, of_multipath(self.views[edge.source])))
+            for edge in edges
+        ]
+        return 1.0 - float(np.mean(shares)) / 6.0 if shares else 1.0
 
     def retries(self) -> Iterator[tuple[int, int]]:
         """Yield lost frames, newest first, each with the next accepted view, if that followed within a few frames."""

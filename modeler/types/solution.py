@@ -211,6 +211,8 @@ class Solution:
     common_shift_m2: Array | None = None
     """(3, 3) covariance in m² of a shift of the surface in all views, part of the covariances; None: 0. It moves poses
     relative to the camera, but does not deform the model."""
+    variance_factor: float = 1.0
+    """On the covariances of edges, for smooth errors of depth that are smaller than stated, as loops show."""
     camera_from_axis: Array | None = None
     """(4, 4), whose third direction is the axis of all steps; None if none was estimated, or it does not fit."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -199,12 +199,18 @@ def graph_check(edges: Sequence[Edge], solution: Solution) -> Check | None:
     return Check(float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
-def default_tolerance_m(views: Iterable[RayImage]) -> float:
-    """Return the error in m of the surface above which a model is called wrong, unless the user says what it is for."""
-    sizes_m, sigmas_m = np.array([(view.size_m, view.sigma_r_m) for view in views]).reshape(-1, 2).T
-    if not len(sizes_m):
+def default_tolerance_m(views: Sequence[RayImage], variance_factor: float = 1.0) -> float:
+    """Return the error in m of the surface above which a model is called wrong, unless the user says what it is for.
+
+    Args:
+        views: of the run.
+        variance_factor: of the solution; smooth errors of depth are smaller by its root.
+    """
+    if not views:
         return 0.0
-    return float(max(TOLERANCE * np.median(sizes_m), TOLERANCE_SDS * np.median(sigmas_m)))
+    size_m, noise_m, smooth_m = np.median([(view.size_m, view.sigma_r_m, view.multipath_m) for view in views], axis=0)
+    sigma_m = np.hypot(noise_m, np.sqrt(variance_factor) * smooth_m)
+    return float(max(TOLERANCE * size_m, TOLERANCE_SDS * sigma_m))
 
 
 def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage], tolerance_m: float) -> Check:

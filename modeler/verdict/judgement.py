@@ -81,7 +81,8 @@ def judged(
         colour: whether colour is to fit depth.
     """
     reasons, frames = [], step.frames_so_far
-    tolerance_m = default_tolerance_m(step.views.values()) if tolerance_m is None else tolerance_m
+    if tolerance_m is None:
+        tolerance_m = default_tolerance_m([*step.views.values()], step.solution.variance_factor)
     if interrupted:
         reasons.append(Shortcoming("interrupted", f"the run was interrupted after frame {step.frame.index}"))
     elif not step.last:

@@ -93,7 +93,7 @@ def spread_of_positions(
     """Return the largest uncertainty of the surface's position in a pose, in m; None without a pose.
 
     What moves the surface of all views alike is not included, because it does not deform the model: a common shift, and
-    the stretch that a wrong focal length causes.
+    the stretch that a wrong focal length causes. Smooth errors of depth are included.
 
     Args:
         views: by frame number; the position is that of a view's centroid.
@@ -111,7 +111,8 @@ def spread_of_positions(
             of_place = se3.covariance_about(given_focal, views[frame].centroid_m)[3:, 3:]
             of_place = of_place - _of_common_shift(solution, frame, reference)
             given_m = one_axis_sd(factor**2 * of_place, tolerance_m)
-            sigmas_m[frame] = float(np.hypot(given_m, deformed_m.get(frame, 0.0)))
+            smooth_m = np.sqrt(solution.variance_factor) * views[frame].multipath_m
+            sigmas_m[frame] = float(np.linalg.norm([given_m, deformed_m.get(frame, 0.0), smooth_m]))
     widest = _widest(sigmas_m, tolerance_m)
     return None if widest is None else replace(widest, by_focal_m=deformed_m.get(widest.frame, 0.0))
 

@@ -134,6 +134,7 @@ class Sensor:
             sigma_r_m=sigma_r_m,
             sigma_colour_px=self.noise.sigma_colour_px,
             sigma_focal=self.noise.sigma_focal,
+            sigma_multipath=self.noise.sigma_multipath,
             points_m=points_m,
             normals=normals,
             pixels=pixels,

@@ -33,7 +33,7 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences.rendering.renderer import RenderedSequence, surroundings
-from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage
+from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage, SensorNoise
 from modeler.views import Sensor
 from studies.calibration.depth_cameras import CAMERAS, DepthCamera, World, placed
 from studies.calibration.specimens import SPECIMENS, Half, Specimen, load_specimen
@@ -107,7 +107,7 @@ class CameraStudy:
             blank = Trial(name, "true", specimen.symmetry, specimen.recipe, condition.distance_m, condition.step_deg,
                           "", "")  # fmt: skip
             for stated, factor in (("true", 1.0), ("nominal", error)):
-                views = viewed([replace(frame, camera=refocused(frame.camera, factor)) for frame in frames], stated)
+                views = viewed([replace(frame, camera=refocused(frame.camera, factor)) for frame in frames], camera)
                 for target, source in pairwise(views):
                     motion = true_motion(truth, target.index, source.index)
                     yield from _pair(replace(blank, stated=stated), source, target, motion, seed)
@@ -133,11 +133,11 @@ def world_of(sequence: RenderedSequence, index: int) -> World:
     return World(placed(thing.vertices_m, thing.triangles, sequence.truth()[index]), beside)
 
 
-def viewed(frames: Sequence[Frame], stated: str) -> list[RayImage]:
-    """Return the views of a sequence; the camera's noise is not given."""
+def viewed(frames: Sequence[Frame], camera: DepthCamera | None) -> list[RayImage]:
+    """Return the views of a sequence; of the camera, None for the renderer's own, at most its kind is given."""
     segmenter = Segmenter()
     scene = segmenter.scene([frames[k] for k in scene_frames(range(len(frames)))])
-    sensor = Sensor().measured(scene.range_noise)
+    sensor = Sensor(SensorNoise(sigma_r_m=None) if camera is None else camera.stated).measured(scene.range_noise)
     return [sensor.ray_image(frame, segmenter.segment(frame, scene).plane) for frame in frames]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, uniform_filter
 
 from modeler import se3
-from modeler.types import Array, BoolArray, Camera
+from modeler.types import MULTIPATH, Array, BoolArray, Camera, SensorNoise
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -94,6 +94,11 @@ class DepthCamera(ABC):
         """The true intrinsics."""
         middle = (self.width - 1) / 2.0, (self.height - 1) / 2.0
         return Camera(self.width, self.height, self.focal_px, self.focal_px, *middle)
+
+    @property
+    def stated(self) -> SensorNoise:
+        """What is known of its errors from its kind alone."""
+        return SensorNoise(sigma_r_m=None)
 
     def rays(self, offset_px: tuple[float, float] = (0.0, 0.0)) -> Array:
         """Return rays (h, w, 3) of unit depth, away from the middle of the pixels by an offset."""
@@ -210,6 +215,11 @@ class TimeOfFlight(DepthCamera):
     """Directions in which each pixel's surface looks for other light."""
     min_amplitude: float = 0.1
     """Of a white surface that faces the camera at 1 m: less is not measured (assumed)."""
+
+    @property
+    def stated(self) -> SensorNoise:
+        """What is known of its errors from its kind alone."""
+        return SensorNoise(sigma_r_m=None, sigma_multipath=MULTIPATH["tof"])
 
     def measure(self, world: World, rng: np.random.Generator, seed: int) -> Array:
         """Return measured depth."""

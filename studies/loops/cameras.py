@@ -26,7 +26,7 @@ from modeler.export import write_atomically
 from modeler.sequences import AbstractSequence
 from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.renderer import RenderedSequence
-from modeler.types import Array, Frame
+from modeler.types import Array, Frame, SensorNoise
 from studies.calibration.by_camera import NOMINAL, chosen, refocused, shown, world_of
 from studies.calibration.depth_cameras import CAMERAS, DepthCamera
 from studies.loops.covariances import judged, pushed
@@ -71,6 +71,10 @@ class Filmed(AbstractSequence):
         depth_m = np.where(np.isfinite(seen.depth_m), seen.depth_m, np.nan).astype(np.float32)
         return Frame(index, float(index), depth_m, self.camera.camera, seen.on_object)
 
+    def sensor(self) -> SensorNoise:
+        """Return what is known of the errors of the camera from its kind."""
+        return self.camera.stated._replace(sigma_focal=NOMINAL)
+
     def truth(self) -> dict[int, Array]:
         """Return the true camera_from_model (4, 4) by frame number."""
         return self.rendered.truth()
@@ -104,7 +108,7 @@ class Run:
     status: int
     """0 or 3."""
     wrong: bool
-    """Whether the model is, as in `make trust`."""
+    """Whether the model is, as in `make trust`, but to its tolerance."""
     placed: int
     """Number of frames in the model."""
     error_deg: float
@@ -112,7 +116,7 @@ class Run:
     error_mm: float
     """Largest error of the object's place."""
     f_score: float
-    """Of the mesh, at 5 mm."""
+    """Of the mesh, at the model's tolerance, or at 5 mm if it is less."""
     nees: float
     """Of poses to the first, an average a degree of freedom."""
     covered: float
@@ -141,7 +145,8 @@ def run(name: str, shape: str, seed: int, frames: int, step_deg: float) -> Run:
     step, report = built(filmed, PriorOptions(), seed)
     solution = step.solution
     errors = pose_errors(replace(filmed, exact=True), step)
-    score = None if step.model is None else f_score(filmed, step.model, solution.trajectory)
+    limit_m = max(MAX_M, float(report["tolerance_m"]))  # a model is trusted to its tolerance
+    score = None if step.model is None else f_score(filmed, step.model, solution.trajectory, limit_m)
     error_deg, error_m, score = (np.inf if errors[0] is None else errors[0], np.inf if errors[1] is None else errors[1],
                                  score or 0.0)  # fmt: skip
     squares = judged(solution, filmed.truth())["pose"] if len(solution.trajectory) > 1 else []
@@ -151,7 +156,7 @@ def run(name: str, shape: str, seed: int, frames: int, step_deg: float) -> Run:
         name,
         shape,
         0 if report["trustworthy"] else 3,
-        error_deg > MAX_DEG or error_m > MAX_M or score < MIN_F,
+        error_deg > MAX_DEG or error_m > limit_m or score < MIN_F,
         len(solution.trajectory),
         error_deg,
         1000.0 * error_m,

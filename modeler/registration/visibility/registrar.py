@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
+from modeler.registration.systematic import of_multipath
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner, first_order
 from modeler.registration.visibility.ridge import without_chance
@@ -177,17 +178,19 @@ class VisibilityRegistrar(AbstractRegistrar):
         """Return the posterior of weighted modes, and its outcome (docs/method/refinement.md)."""
         samples = np.concatenate([mode.poses for _, mode in weighted])
         weights = np.concatenate([share * mode.weights for share, mode in weighted])
+        systematic = of_multipath(pair.backward.image)
+
+        def gaussian(poses: Array, weights: Array, by_focal: Array) -> PoseGaussian:
+            found = weighted_gaussian(poses, weights, pair.centre_m)
+            return PoseGaussian(found.mean, found.covariance + systematic, by_focal)
+
         modes = tuple(
-            Mode(
-                share,
-                replace(weighted_gaussian(mode.poses, mode.weights, pair.centre_m), by_focal=mode.nuisance.by_focal),
-            )
-            for share, mode in weighted
+            Mode(share, gaussian(mode.poses, mode.weights, mode.nuisance.by_focal)) for share, mode in weighted
         )
         separate = len(modes) == 1 or are_separate(modes)
         pose = pooled(modes)
         if not separate:
-            pose = replace(weighted_gaussian(samples, weights, pair.centre_m), by_focal=pose.by_focal)
+            pose = gaussian(samples, weights, pose.by_focal)
         overlap = pair.overlap(modes[0].pose.mean)
         # Among very many poses, some match by chance; among few, the likeliest is right even if a mask is truncated.
         contradicted = not pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
