@@ -43,6 +43,8 @@ class Build:
     ROS bag, MCAP, RealSense or Azure Kinect recording; realsense:, orbbec:, oak: or azure: for a connected one."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """Run folder to create: model.ply, cloud.ply, trajectory.txt, graph.g2o, report.json, recording.rrd and more."""
+    known: Annotated[Path | None, tyro.conf.arg(name="model", metavar="RUN0"), default("none")] = None
+    """Go on with the model of this run: frames are placed on it, and one graph has those of both recordings."""
     overwrite: bool = False
     """Replace the results of an earlier run in the folder."""
     resume: bool = False
@@ -73,7 +75,7 @@ class Build:
         """
         from modeler.composition import compose
         from modeler.export import PairCache, RunFolder, RunMeta, locked
-        from modeler.runs.outputs import check_run_folder
+        from modeler.runs.outputs import check_run_folder, run_inputs
         from modeler.runs.reopening import estimated_camera
         from modeler.segmentation import scene_frames
         from modeler.system.concurrency import in_parallel
@@ -82,8 +84,11 @@ class Build:
         began_s = time.perf_counter()
         _check(self)
         inputs = [path for path in (self.sequence, self.model.sensor, self.model.camera) if path is not None]
+        inputs += [] if self.known is None else run_inputs([self.known])
         check_run_folder(self.out, inputs, overwrite=self.overwrite, resume=self.resume)
         whole, frames, digests = _opened(self)
+        if self.known is not None:
+            return _go_on(self, self.known, frames)
         modeler = compose.modeler(whole, self.prior, self.method, self.where)
         tolerance_m = None if self.model.tolerance_mm is None else 1e-3 * self.model.tolerance_mm
         modeler = replace(modeler, fuser=replace(modeler.fuser, voxel_m=self.model.voxel_m), tolerance_m=tolerance_m)
@@ -173,6 +178,23 @@ class Build:
         )
 
 
+def _go_on(options: Build, known: Path, frames: AbstractSequence) -> int:
+    """Go on with the model of a run, and return the exit status.
+
+    Raises:
+        InputError: if the input or the folder cannot be used.
+    """
+    from modeler.runs.growing import Growth
+
+    compile_kernels(say)
+    growth = Growth(options.where, options.given.overrides(), options.method.seed)
+    done = growth.run(known, options.sequence, frames, options.out, overwrite=options.overwrite)
+    say(f"{done.placed} of {done.frames} frames placed on the model of {known}: {options.out}")
+    if done.verdict.reasons:
+        say(f"not to be trusted: {done.verdict.reasons[0]}")
+    return 0 if done.verdict.trustworthy else 3
+
+
 def _check(options: Build) -> None:
     """Reject options that contradict each other or are out of range.
 
@@ -184,6 +206,8 @@ def _check(options: Build) -> None:
 
     if options.resume and options.overwrite:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
+    if options.known is not None and (options.resume or options.watch or options.prior.prior):
+        raise InputError("--model places frames on a finished model; leave out --resume, --watch and --prior")
     voxel_m = options.model.voxel_m
     if voxel_m is not None and not MIN_VOXEL_M <= voxel_m < 1.0:
         raise InputError(f"--voxel-m {voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")

@@ -313,6 +313,8 @@ _EDGE: dict[str, Test] = {
 }
 _SETTINGS: dict[str, Test] = {
     "joined": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_is_text, value)),
+    "continues": _is_text,
+    "same_camera": _is(bool),
     "offset": _is_whole,
     "later_s": _is_number,
     "sensor": _is_text,

@@ -103,6 +103,8 @@ class Joiner:
     """Returns a view with the images that a likelihood looks up."""
     pairs: int = 6
     """Number of pairs of views to register, one of each segment."""
+    sigma_rad: float = _ALIGNMENT_SIGMA_RAD
+    """Standard deviation of the rotation of an alignment about which pairs are registered."""
 
     def join(self, target: Segment, source: Segment) -> list[Alignment]:
         """Return the possible alignments of two segments, likeliest first.
@@ -205,15 +207,28 @@ class Joiner:
 
     def _edges(self, target: Segment, source: Segment, target_from_source: Array) -> tuple[Edge, ...]:
         """Return edges, accepted or rejected, between views of two segments from nearly the same side."""
+        return self.between(target, source, facing(target, source, target_from_source, self.pairs), target_from_source)
+
+    def between(
+        self, target: Segment, source: Segment, pairs: Sequence[tuple[int, int]], target_from_source: Array
+    ) -> tuple[Edge, ...]:
+        """Return edges, accepted or rejected, between pairs of views of two segments that are aligned roughly.
+
+        Args:
+            target: segment of the first views.
+            source: segment of the second.
+            pairs: numbers of the views.
+            target_from_source: (4, 4).
+        """
         edges = []
-        for t, s in facing(target, source, target_from_source, self.pairs):
+        for t, s in pairs:
             views = self.ready(source.views[s]), self.ready(target.views[t])
             guess = se3.inverse(target.solution.trajectory[t]) @ target_from_source @ source.solution.trajectory[s]
             density = KernelMixture(
                 guess[None],
                 np.ones(1),
                 centre_m=views[0].centroid_m,
-                sigma_rad=_ALIGNMENT_SIGMA_RAD,
+                sigma_rad=self.sigma_rad,
                 sigma_m=_ALIGNMENT_SIGMA * views[0].size_m,
                 evidence=False,
             )
@@ -233,7 +248,7 @@ class Joiner:
             return Edge(posterior, "join", False, ElsewhereThanSegments(float(np.degrees(away_rad))))
         pair = self._pair(*views)
         sigma_rad, _ = widest_rotation(posterior)
-        if sigma_rad > _OPEN_SHARE * _ALIGNMENT_SIGMA_RAD:
+        if sigma_rad > _OPEN_SHARE * self.sigma_rad:
             return Edge(posterior, "join", False, OpenRotation(float(np.degrees(sigma_rad))))
         if not pair.fits(posterior.pose.mean, self._search.fine_m(pair)):  # method, eq. 6.5
             return Edge(posterior, "join", False, Failed(Outcome.NO_OVERLAP, posterior.overlap))

@@ -75,6 +75,8 @@ def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> 
             settings[name] = made.stored(RunFolder(run).located(settings[name]))
     if "joined" in settings:
         settings["joined"] = [made.stored(RunFolder(run).located(part)) for part in settings["joined"]]
+    if "continues" in settings:
+        settings["continues"] = made.stored(RunFolder(run).located(settings["continues"]))
     settings["dropped"] = sorted({*settings.get("dropped", ()), *dropped, *unconnected})
     sequences = [made.stored(RunFolder(run).located(one)) for one in report["sequence"].split(" + ")]
     meta = RunMeta(" + ".join(sequences), report["seed"], report["prior"], settings, report.get("camera"))

@@ -52,8 +52,8 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
     began_s = time.perf_counter()
     first, second = reopened(run_a), reopened(run_b)
     offset = max(record["id"] for record in first.report["frames"]) + 1
-    later_s = _later_s(first, second)
-    second = _shifted(second, offset, later_s)
+    delay_s = later_s(first, second)
+    second = _shifted(second, offset, delay_s)
     joiner = Joiner(Registrations(VisibilityRegistrar(), seed), pairs=pairs)
     parts = [Segment(run.views, run.solution, run.edges) for run in (first, second)]
     alignments = joiner.join(*parts)
@@ -82,7 +82,7 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
         settings={
             "joined": [made.stored(run) for run in (run_a, run_b)],
             "offset": offset,
-            "later_s": later_s,
+            "later_s": delay_s,
             "pairs": pairs,
         },
         camera=_least_known([*first.parts, *second.parts]),
@@ -105,7 +105,7 @@ def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
     return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
 
 
-def _later_s(first: Reopened, second: Reopened) -> float:
+def later_s(first: Reopened, second: Reopened) -> float:
     """Return by how much a run must be later than it was for its times to follow another's: 0 where none is shared."""
     times_s = [sorted(frame["timestamp"] for frame in run.report["frames"]) for run in (first, second)]
     (begin_s, *_, end_s), (start_s, *_, stop_s) = ([times[0], times[-1]] for times in times_s)

@@ -101,7 +101,10 @@ def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, 
         if isinstance(settings.get("joined"), list):
             waiting += [folder.located(part) for part in settings["joined"] if isinstance(part, str)]
             continue
-        files = (report.get("sequence"), settings.get("sensor"), settings.get("camera"))
+        if isinstance(settings.get("continues"), str):
+            waiting.append(folder.located(settings["continues"]))
+        own = str(report.get("sequence")).split(" + ")[-1] if "continues" in settings else report.get("sequence")
+        files = (own, settings.get("sensor"), settings.get("camera"))
         found |= {folder.located(file): None for file in files if isinstance(file, str)}
     return (*found, *moved)
 

@@ -84,30 +84,36 @@ class Part:
         Raises:
             InputError: if the sequence differs from that of the run.
         """
-        (modeler, scene), views = self._looking, {}
-        points = {record["id"]: record["points"] for record in self.report["frames"]}
-        log_factor = math.log((self.report.get("camera") or {}).get("factor_in_run", 1.0))
+        views, points = {}, {record["id"]: record["points"] for record in self.report["frames"]}
         for frame in frames:
-            view = modeler.prepare(self.sequence.frame(frame), scene).view
+            view = self.view(frame)
             if view is None or abs(len(view.points_m) - points[frame]) > _ALIKE * points[frame]:
                 raise InputError(
                     f"{self.sequence.name}: frame {frame} differs from the one that {self.run} was made "
                     "from, or another version segments it differently; give the original sequence with "
                     "`sequence`, or build the run again"
                 )
-            if log_factor:
-                view = self.sensor.refocused(view, log_factor)
-            views[frame + self.offset] = renumbered(view, self.offset, self.later_s)
+            views[view.index] = view
         return views
+
+    def view(self, frame: int) -> RayImage | None:
+        """Return the view of a frame, its own number, as it is in the joined run; None if no object is found in it."""
+        modeler, scene = self.looking
+        view = modeler.prepare(self.sequence.frame(frame), scene).view
+        if view is None:
+            return None
+        log_factor = math.log((self.report.get("camera") or {}).get("factor_in_run", 1.0))
+        view = self.sensor.refocused(view, log_factor) if log_factor else view
+        return renumbered(view, self.offset, self.later_s)
 
     @property
     def sensor(self) -> Sensor:
         """Noise of the camera that took the sequence."""
-        modeler, scene = self._looking
+        modeler, scene = self.looking
         return modeler.sensor.measured(scene.range_noise)
 
     @cached_property
-    def _looking(self) -> tuple[Modeler, Scene]:
+    def looking(self) -> tuple[Modeler, Scene]:
         """The components that find the object, and the scene learned from the sequence."""
         settings = self.report["settings"]
         roi = settings.get("roi")
@@ -126,7 +132,7 @@ class Part:
 
 
 def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
-    """Return the parts of a run: itself, or the runs that it joins.
+    """Return the parts of a run: itself, the runs that it joins, or the run that it continues and its own recording.
 
     Args:
         run: run folder.
@@ -156,13 +162,30 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
         offset, later_s = int(settings["offset"]), float(settings.get("later_s", 0.0))
         moved = (replace(part, offset=part.offset + offset, later_s=part.later_s + later_s) for part in second)
         return (*first, *moved)
+    first: tuple[Part, ...] = ()
+    if "continues" in settings:
+        first = _parts(folder.located(settings["continues"]), places, (*within, run.resolve()))
+        report = _of_recording(report)
     if places is not None and not places:
         raise InputError(f"`sequence` is given too few times; give that of {run}, too, in order")
     where = folder.located(report["sequence"]) if places is None else places.popleft()
     if not where.exists():
         raise InputError(f"{where}: the sequence of {run} does not exist; give its new place with `sequence`")
     sensor, camera = (folder.located(settings[name]) if name in settings else None for name in ("sensor", "camera"))
-    return (Part(run, report, calibrated(open_sequence(where, _overrides(settings)), sensor, camera)),)
+    sequence = calibrated(open_sequence(where, _overrides(settings)), sensor, camera)
+    return (*first, Part(run, report, sequence, int(settings.get("offset", 0)), float(settings.get("later_s", 0.0))))
+
+
+def _of_recording(report: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the part of a report about the recording with which a run continues another, by its own numbers."""
+    offset, later_s = report["settings"]["offset"], report["settings"].get("later_s", 0.0)
+    frames = [
+        record | {"id": record["id"] - offset, "timestamp": record["timestamp"] - later_s}
+        for record in report["frames"]
+        if record["id"] >= offset
+    ]
+    camera = report["camera"] if report["settings"].get("same_camera") else None
+    return dict(report) | {"frames": frames, "sequence": report["sequence"].split(" + ")[-1], "camera": camera}
 
 
 def _overrides(settings: Mapping[str, Any]) -> Overrides:

@@ -46,7 +46,7 @@ class ModelCloud:
     @cached_property
     def detector(self) -> Any:
         """OpenCV's detector of point pairs, trained."""
-        import cv2
+        import cv2  # pyright: ignore[reportMissingImports]
 
         found = cv2.ppf_match_3d.PPF3DDetector(*_PAIRS)
         found.trainModel(_rows(self.cloud))

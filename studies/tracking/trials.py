@@ -143,7 +143,9 @@ def followed(name: str) -> list[Trial]:
         where = "followed", f"{name} {frame.index}"
         found.append(_trial(where, sought, frame, truth[frame.index], 1.0))
         view = prepare(frame, Segmented(), sought.tracker.segmenter, sensor).view
-        for method, run in methods(local=True).items() if view is not None and frame.index else ():
+        if view is None or frame.index == sequence.indices[0]:
+            continue
+        for method, run in methods(local=True).items():
             began_s = time.process_time()
             answer = run(thing, view, last[method])
             seconds = time.process_time() - began_s

@@ -261,7 +261,7 @@ def _settings(result: Result) -> str:
 def _name(result: Result) -> str:
     """Return the name of the sequence, of joined runs the names of all."""
     where = str(result.report["sequence"])
-    parts = where.split(" + ") if "joined" in result.report["settings"] else [where]
+    parts = where.split(" + ") if {"joined", "continues"} & result.report["settings"].keys() else [where]
     return " + ".join(Path(part).name for part in parts) or "model"
 
 
