@@ -18,7 +18,7 @@ from modeler.sequences.depth_files import metres
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens, coefficients
 from modeler.system.extras import install_command
-from modeler.types import Camera, Frame, InputError
+from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, Camera, Frame, InputError, SensorNoise
 
 FIRST = 10
 """Number of frames taken before the sequence is described."""
@@ -74,6 +74,17 @@ class LiveSequence(AbstractSequence):
     """Keep these frame numbers."""
     stop: Callable[[], bool] = lambda: False
     """Polled before each image; true ends the sequence."""
+    by_maker: bool = True
+    """Whether the intrinsics are the maker's, not the user's."""
+
+    def sensor(self) -> SensorNoise:
+        """Return what the camera's model says of its errors."""
+        by_time_of_flight = any(name in self.camera.name for name in _TIME_OF_FLIGHT)
+        return SensorNoise(
+            sigma_r_m=None,
+            sigma_focal=CALIBRATED_FOCAL if self.by_maker else NOMINAL_FOCAL,
+            sigma_multipath=MULTIPATH["tof" if by_time_of_flight else "stereo"],
+        )
 
     @property
     def name(self) -> str:
@@ -162,6 +173,8 @@ ADVICE = f"a RealSense camera is read by its maker's library; {install_command('
 WARM_UP = 30
 """Images after which exposure has settled."""
 TIMEOUT_MS = 5000
+_TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")
+"""Names of models that measure so; others see structured light or stereo pairs."""
 
 
 def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveSequence:
@@ -182,7 +195,7 @@ def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveS
     camera = RealsenseCamera.start(library, serial, overrides, context)
     for _ in range(WARM_UP if context is None else 0):
         camera.take()
-    return begin(camera)
+    return replace(begin(camera), by_maker=overrides.intrinsics is None)
 
 
 def _check_present(rs: Any, context: Any, serial: str) -> None:

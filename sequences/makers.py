@@ -258,4 +258,4 @@ def open_camera_of(maker: str, serial: str, overrides: Overrides) -> LiveSequenc
     weakref.finalize(camera, camera.stop)
     for _ in range(WARM_UP):
         camera.take()
-    return begin(camera)
+    return replace(begin(camera), by_maker=overrides.intrinsics is None)

@@ -16,7 +16,7 @@ import pytest
 from modeler.cli import main
 from modeler.sequences import Overrides, open_sequence
 from modeler.sequences.makers import LIBRARIES
-from modeler.types import InputError
+from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, InputError, SensorNoise
 from studies.formats.image_folders import raw_depth, small_frames
 
 FRAMES = small_frames(3)
@@ -214,6 +214,9 @@ def test_frames_of_a_camera_are_read(maker: str, shown: Shown) -> None:
     sequence = open_sequence(f"{maker}:CL1")
     assert sequence.live
     assert sequence.name in ("Orbbec Femto Bolt", "OAK-D-LITE", "Azure Kinect CL1")
+    by_time_of_flight = 0.0 if maker == "oak" else MULTIPATH["tof"]
+    known = SensorNoise(sigma_r_m=None, sigma_focal=CALIBRATED_FOCAL, sigma_multipath=by_time_of_flight)
+    assert sequence.sensor() == known
     read = list(itertools.islice(sequence, 14))
     assert [frame.index for frame in read] == list(range(14))
     assert (np.diff([frame.time_s for frame in read]) > 0.05).all()
@@ -234,6 +237,9 @@ def test_frames_of_a_camera_are_read(maker: str, shown: Shown) -> None:
 def test_values_that_are_given_count_before_those_of_a_camera(maker: str, shown: Shown) -> None:
     sequence = open_sequence(f"{maker}:", Overrides(intrinsics=(100.0, 101.0, 40.0, 30.0), depth_scale_mm=2.0))
     frame = next(iter(sequence))
+    noise = sequence.sensor()
+    assert noise is not None
+    assert noise.sigma_focal == NOMINAL_FOCAL
     assert (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy) == (100.0, 101.0, 40.0, 30.0)
     wrote = FRAMES[round(frame.time_s / 0.1) % len(FRAMES)]
     np.testing.assert_allclose(frame.depth_m, 2.0 * wrote.depth_m, atol=2e-3)
