@@ -25,6 +25,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "colour": ("what colour tells: aligned, displaced, faint and natural", "half an hour a core"),
     "far_apart": ("registration of views that are far apart", "3 minutes"),
     "far_apart.few_frames": ("whole models from four or six views", "minutes"),
+    "followed": ("draw the model of a run into frames in which it is found, with the region of its place", "a minute"),
     "fuzz": ("damaged inputs of every format: read, or refused in one line", "hours"),
     "fuzz.guided": ("the same for one format, led by coverage (needs atheris)", "as long as told"),
     "growing": ("draw a model that grows, with the uncertainty of its poses", "a minute"),
