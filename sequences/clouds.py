@@ -139,6 +139,10 @@ def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
     else:
         whole, known = True, find_intrinsics(path, overrides) if path.is_dir() else None
         intrinsics = known.intrinsics if intrinsics is None and known is not None else intrinsics
+        pixels = _image_coordinates(first_path) if intrinsics is None else None
+        if pixels is not None:
+            intrinsics = _fitted(first.points * (_TURNED if backward else 1.0), pixels, first_path)
+            remarks.append("intrinsics are fitted to the image coordinates (imX, imY) of the first cloud's points")
         if intrinsics is None:
             intrinsics = _on_a_grid(_slopes(first, backward=backward), first_path)
             whole = False
@@ -324,16 +328,28 @@ def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
     Raises:
         InputError: if no pinhole camera that looks along z saw them.
     """
-    rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] > 1e-9))
-    if rows.size < 100:
-        raise InputError(f"{path}: has only {rows.size} points before the camera; z must point forward, in m.")
+    rows, columns = np.indices(points.shape[:2])
+    return _fitted(points.reshape(-1, 3), np.stack([columns.ravel(), rows.ravel()], axis=1), path)
+
+
+def _fitted(points: npt.NDArray[np.float64], pixels: npt.NDArray[np.generic], path: Path) -> Intrinsics:
+    """Return the intrinsics of the camera that saw points (n, 3) at pixels (n, 2).
+
+    Raises:
+        InputError: if no pinhole camera that looks along z saw them.
+    """
+    seen = np.isfinite(points).all(axis=1) & (points[:, 2] > _LEAST_Z) & np.isfinite(pixels).all(axis=1)
+    if np.count_nonzero(seen) < 100:
+        raise InputError(
+            f"{path}: has only {np.count_nonzero(seen)} points before the camera; z must point forward, in m."
+        )
     found, off_px = [], []
-    for axis, pixels in ((0, columns), (1, rows)):
-        slope = points[rows, columns, axis] / points[rows, columns, 2]
+    for axis in (0, 1):
+        slope = points[seen, axis] / points[seen, 2]
         design = np.stack([slope, np.ones(slope.size)], axis=1)
-        line, *_ = np.linalg.lstsq(design, pixels.astype(np.float64), rcond=None)
+        line, *_ = np.linalg.lstsq(design, pixels[seen, axis].astype(np.float64), rcond=None)
         found.append(line)
-        off_px.append(float(np.median(np.abs(design @ line - pixels))))
+        off_px.append(float(np.median(np.abs(design @ line - pixels[seen, axis]))))
     (fx, cx), (fy, cy) = ((float(slope), float(start)) for slope, start in found)
     if max(off_px) > MAX_OFF_PX or not sane((fx, fy, cx, cy)):
         raise InputError(
@@ -366,6 +382,20 @@ def _read_pcd(file: BinaryIO) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.f
         cloud = o3d.io.read_point_cloud(open_file, format="pcd", remove_nan_points=False, remove_infinite_points=False)
     shares = np.nan_to_num(np.asarray(cloud.colors, dtype=np.float64)).clip(0.0, 1.0)
     return np.asarray(cloud.points, dtype=np.float64), np.rint(255.0 * shares)
+
+
+def _image_coordinates(path: Path) -> npt.NDArray[np.float64] | None:
+    """Return the pixels (n, 2) at which the points of a PCD were seen, where it has them, as Washington's."""
+    if path.suffix.lower() != ".pcd":
+        return None
+    with input_errors(path, "cloud", "save it again"), open_regular(path) as file:
+        if re.search(rb"(?m)^FIELDS\b.* imX imY\b", file.read(_HEADER_BYTES)) is None:
+            return None
+        import open3d as o3d
+
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            read = o3d.t.io.read_point_cloud(f"/dev/fd/{file.fileno()}", format="pcd")
+        return np.hstack([read.point[name].numpy().astype(np.float64) for name in ("imX", "imY")])
 
 
 def _read_ply(file: BinaryIO) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import final
+from typing import Final, final
 
 import numpy as np
 
@@ -46,6 +46,8 @@ from modeler.sequences.input_files import (
 from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, cameras_of_frames, find_intrinsics
 from modeler.sequences.lens import Lens
 from modeler.sequences.recording import AbstractRecording
+from modeler.sequences.video import Video, can_decode
+from modeler.system.extras import install_command
 from modeler.types import Array, Camera, Frame, InputError
 
 
@@ -89,6 +91,8 @@ class ImageFolderSequence(AbstractRecording):
     """Reads the true camera_from_model (4, 4) in m by frame number, when it is asked for."""
     remarks: tuple[str, ...] = ()
     """Assumptions and omissions of the reader."""
+    video: Video | None = None
+    """Colour by frame number, where it is no files."""
 
     def __post_init__(self) -> None:
         """Check `sequence.json`.
@@ -128,8 +132,10 @@ class ImageFolderSequence(AbstractRecording):
         for path, image in ((files.mask, labels), (files.occluder, occluder)):
             if path is not None and image is not None:
                 check_size(path, image.shape, raw.shape)
-        if files.colour is not None and colour is not None:
-            colour = resize_to_depth(files.colour, colour, raw.shape)
+        if self.video is not None:
+            colour = self.video.image(index)
+        if colour is not None:
+            colour = resize_to_depth(files.colour or self.path / VIDEO, colour, raw.shape)
         depth_m = metres(raw, self.depth_scale_mm)
         if files.confidence is not None:
             trusted = read_mask(files.confidence)
@@ -139,7 +145,8 @@ class ImageFolderSequence(AbstractRecording):
         lens, camera = self._lens, self._lens.camera
         if files.intrinsics is not None:
             camera = Camera(camera.width, camera.height, *files.intrinsics)
-        elif lens.is_distorted:
+            lens = replace(lens, camera=camera)
+        if lens.is_distorted:
             depth_m = lens.undistort(depth_m, float("nan"))
             mask, occluder = (None if image is None else lens.undistort(image) for image in (mask, occluder))
             colour = None if colour is None else lens.undistort(colour)
@@ -318,6 +325,12 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
         )
         for stem, image in depth.items()
     }
+    video = None
+    if not found.colour and is_there(path / VIDEO) and can_decode():
+        video = Video(path / VIDEO)
+        remarks.append(f"colour is that of {VIDEO}, its images counted as depth images are")
+    elif not found.colour and is_there(path / VIDEO):
+        remarks.append(f"colour of {VIDEO} is not read: {install_command('phones')}")
     unit_mm, who = facts.unit(overrides, (1.0, "the default"))
     raw = read_depth(first)
     if is_swapped(raw):
@@ -338,7 +351,12 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
         unit_source=who,
         read_truth=lambda: _posed_truth(path, numbers),
         remarks=tuple(remarks),
+        video=video,
     )
+
+
+VIDEO: Final = "rgb.mp4"
+"""Stray Scanner's, of the same view as depth."""
 
 
 def _is_seven_scenes(depth: Path) -> bool:

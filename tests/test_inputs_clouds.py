@@ -175,3 +175,30 @@ def test_a_mesh_is_no_sequence(tmp_path: Path) -> None:
     (tmp_path / "m.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nelement face 0\nend_header\n")
     with pytest.raises(InputError, match="not organised"):
         open_sequence(tmp_path / "m.ply")
+
+
+def test_image_coordinates_of_points_tell_the_camera(
+    tmp_path: Path, frames: list[Frame], rng: np.random.Generator
+) -> None:
+    """As PCDs of Washington's data set have them; points are rounded, which lie on no grid then."""
+    for frame in frames:
+        rows, columns = np.nonzero(np.isfinite(frame.depth_m))
+        w, h = (each[rows, columns] for each in frame.camera.rays())
+        z = frame.depth_m[rows, columns].astype(float)
+        lines = [
+            f"{a + e:.3f} {b + f:.3f} {c:.3f} 0 {u} {v}"
+            for a, b, c, e, f, u, v in zip(
+                w * z, h * z, z, *rng.normal(0.0, 1e-3, (2, len(z))), columns, rows, strict=True
+            )
+        ]
+        header = (
+            f"VERSION .7\nFIELDS x y z rgb imX imY\nSIZE 4 4 4 4 4 4\nTYPE F F F F F F\nCOUNT 1 1 1 1 1 1\n"
+            f"WIDTH {len(z)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(z)}\nDATA ascii\n"
+        )
+        (tmp_path / f"cup_1_1_{frame.index}.pcd").write_text(header + "\n".join(lines) + "\n")
+    sequence = open_sequence(tmp_path)
+    assert any("imX, imY" in note for note in sequence.notes)
+    read, wrote = sequence.frame(0), frames[0]
+    ours, theirs = read.camera, wrote.camera
+    expected = (theirs.fx, theirs.fy, theirs.cx, theirs.cy)
+    assert (ours.fx, ours.fy, ours.cx, ours.cy) == pytest.approx(expected, abs=1.0)

@@ -16,7 +16,7 @@ from PIL import Image
 from modeler.composition import compose
 from modeler.composition.options import PriorOptions
 from modeler.export import RunFolder, RunMeta
-from modeler.sequences import open_sequence, survey
+from modeler.sequences import Overrides, open_sequence, survey
 from modeler.types import Camera, Frame, InputError
 from studies.formats.image_folders import raw_depth, save
 
@@ -209,3 +209,32 @@ def test_frames_of_nerfstudio_have_cameras_of_their_own(tmp_path: Path, frames: 
     (tmp_path / "transforms.json").write_text(json.dumps({"w": 160, "h": 120, "frames": shots}))
     for read, wrote in zip(open_sequence(tmp_path), frames, strict=True):
         assert read.camera == replace(wrote.camera, fx=wrote.camera.fx + wrote.index)
+
+
+def test_colour_of_a_video_belongs_to_depth_by_number(tmp_path: Path, frames: list[Frame]) -> None:
+    """As Stray Scanner writes it: images of the same view, larger; one may be missing at the end."""
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "rgb.mp4"), "w") as container:
+        track = container.add_stream("mpeg4", rate=30)
+        track.width, track.height, track.pix_fmt, track.bit_rate = 320, 240, "yuv420p", 8_000_000
+        for frame in frames[:-1]:
+            assert frame.colour is not None
+            picture = av.VideoFrame.from_ndarray(larger(frame.colour, 2), format="rgb24")
+            container.mux(track.encode(picture))
+        container.mux(track.encode())
+    for frame in frames:
+        save(tmp_path / "depth" / f"{frame.index:06d}.png", raw_depth(frame, 1.0))
+    camera = enlarged(frames[0].camera, 1.0)
+    (tmp_path / "camera_matrix.csv").write_text(
+        f"{camera['fx']}, 0, {camera['cx']}\n0, {camera['fy']}, {camera['cy']}\n0, 0, 1\n"
+    )
+    sequence = open_sequence(tmp_path, Overrides(intrinsics=(camera["fx"], camera["fy"], camera["cx"], camera["cy"])))
+    assert "colour is that of rgb.mp4, its images counted as depth images are" in sequence.notes
+    for index in (*sequence.indices, 1, 0):  # also back
+        colour, wrote = sequence.frame(index).colour, frames[index].colour
+        assert (colour is None) == (index == frames[-1].index)
+        if colour is not None and wrote is not None:
+            assert np.abs(colour.astype(float) - wrote).mean() < 8.0
+    (tmp_path / "rgb.mp4").write_bytes((tmp_path / "rgb.mp4").read_bytes()[:500])
+    with pytest.raises(InputError, match=r"rgb\.mp4: is not a readable video"):
+        open_sequence(tmp_path).frame(0)
