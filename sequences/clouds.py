@@ -329,10 +329,10 @@ def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
         InputError: if no pinhole camera that looks along z saw them.
     """
     rows, columns = np.indices(points.shape[:2])
-    return _fitted(points.reshape(-1, 3), np.stack([columns.ravel(), rows.ravel()], axis=1), path)
+    return _fitted(points.reshape(-1, 3), np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64), path)
 
 
-def _fitted(points: npt.NDArray[np.float64], pixels: npt.NDArray[np.generic], path: Path) -> Intrinsics:
+def _fitted(points: npt.NDArray[np.float64], pixels: npt.NDArray[np.float64], path: Path) -> Intrinsics:
     """Return the intrinsics of the camera that saw points (n, 3) at pixels (n, 2).
 
     Raises:
@@ -347,7 +347,7 @@ def _fitted(points: npt.NDArray[np.float64], pixels: npt.NDArray[np.generic], pa
     for axis in (0, 1):
         slope = points[seen, axis] / points[seen, 2]
         design = np.stack([slope, np.ones(slope.size)], axis=1)
-        line, *_ = np.linalg.lstsq(design, pixels[seen, axis].astype(np.float64), rcond=None)
+        line, *_ = np.linalg.lstsq(design, pixels[seen, axis], rcond=None)
         found.append(line)
         off_px.append(float(np.median(np.abs(design @ line - pixels[seen, axis]))))
     (fx, cx), (fy, cy) = ((float(slope), float(start)) for slope, start in found)
@@ -394,7 +394,7 @@ def _image_coordinates(path: Path) -> npt.NDArray[np.float64] | None:
         import open3d as o3d
 
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            read = o3d.t.io.read_point_cloud(f"/dev/fd/{file.fileno()}", format="pcd")
+            read = o3d.t.io.read_point_cloud(Path(f"/dev/fd/{file.fileno()}"), format="pcd")
         return np.hstack([read.point[name].numpy().astype(np.float64) for name in ("imX", "imY")])
 
 
