@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from modeler import se3
 from studies.multiplied.judged import apart
@@ -15,7 +16,7 @@ from studies.whole.cameras import KINDS as CAMERAS
 from studies.whole.capture import Capture
 from studies.whole.plan import HALVES, Factors, Plan, motion
 from studies.whole.shapes import KINDS
-from studies.whole.study import Outcome
+from studies.whole.study import Outcome, symmetries
 from studies.whole.tables import COLUMNS, counts
 from studies.whole.things import Thing, read
 
@@ -86,7 +87,7 @@ def test_depth_is_that_of_the_mesh_in_its_true_pose(camera: str) -> None:
     depth_m = frame.depth_m[seen].astype(float)
     points_m = np.stack([w[seen] * depth_m, h[seen] * depth_m, depth_m], axis=1)
     scene = o3d.t.geometry.RaycastingScene()
-    mesh = capture._mesh
+    mesh = capture.mesh
     vertices_m, triangles = mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32)
     scene.add_triangles(o3d.core.Tensor.from_numpy(vertices_m), o3d.core.Tensor.from_numpy(triangles))
     places_m = se3.transform(se3.inverse(truth), points_m).astype(np.float32)
@@ -121,6 +122,14 @@ def test_errors_ignore_a_shift_of_all_views_but_not_a_pose() -> None:
     assert apart({**true, 2: true[2] @ shift}, true, points_m)[1] > 1e-3
     wrong = {**true, 2: true[2] @ se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))}
     assert apart(wrong, true, points_m)[0] > 4.0
+
+
+def test_a_plain_box_is_the_same_after_half_a_turn_and_a_jug_is_not() -> None:
+    box, square = (trimesh.creation.box(size) for size in ([0.3, 0.2, 0.1], [0.2, 0.2, 0.1]))
+    jug = THINGS[0]
+    found = [len(symmetries(np.asarray(mesh.vertices), np.asarray(mesh.faces))) for mesh in (box, square)]
+    assert found == [4, 8]
+    assert len(symmetries(jug.vertices, jug.triangles)) == 1
 
 
 def test_outcomes_are_read_as_they_are_written() -> None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.composition.options import PriorOptions
 from modeler.sequences import AbstractSequence
-from modeler.types import Array, BoolArray, Camera, Frame, SensorNoise
+from modeler.types import CALIBRATED_FOCAL, Array, BoolArray, Camera, Frame, SensorNoise
 from studies.whole.cameras import KINDS, Lens, Seen
 from studies.whole.plan import Factors, motion, signed_step_deg
 from studies.whole.things import Thing
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 Faces = tuple[Array, npt.NDArray[np.int64]]
 """Vertices (v, 3) in m, and the triangles (t, 3) between them."""
-_DEVICE: Final = 0.005
-"""Standard deviation of a focal length's logarithm that is read from the device."""
 _FAR: Final = 8.0
 """Distances of the object beyond which a camera that is set to it measures nothing."""
 _OBJECT, _BELOW, _BEHIND, _HAND = range(4)
@@ -61,7 +59,9 @@ class Capture(AbstractSequence):
 
     def sensor(self) -> SensorNoise | None:
         """Return what a device says of its focal length; None if nothing is said."""
-        return SensorNoise(sigma_r_m=None, sigma_focal=_DEVICE) if self.factors.intrinsics == "device" else None
+        return (
+            SensorNoise(sigma_r_m=None, sigma_focal=CALIBRATED_FOCAL) if self.factors.intrinsics == "device" else None
+        )
 
     def truth(self) -> dict[int, Array]:
         """Return the true camera_from_model (4, 4) by frame number."""
@@ -94,7 +94,8 @@ class Capture(AbstractSequence):
         return motion(self.factors, np.random.default_rng([self.seed, 1]))
 
     @cached_property
-    def _mesh(self) -> Thing:
+    def mesh(self) -> Thing:
+        """The object, in m."""
         named = next(thing for thing in self.things if thing.name == self.factors.thing)
         stretched = Thing.of(named.name, named.vertices * self.factors.stretch, named.triangles)
         vertices_m = self.factors.size_m * stretched.vertices
@@ -117,7 +118,7 @@ class Capture(AbstractSequence):
         right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
         axes = np.stack([right, np.cross(ahead, right), ahead])
         axes = Rotation.from_rotvec([0.0, 0.0, np.radians(drawn.roll_deg)]).as_matrix() @ axes
-        vertices_m = self._mesh.vertices
+        vertices_m = self.mesh.vertices
         middle_m = np.array([0.0, 0.0, 0.5 * (vertices_m[:, 2].min() + vertices_m[:, 2].max())])
         offset_m = np.array([0.0, 0.0, drawn.distance_m])
         if drawn.cut:
@@ -186,7 +187,7 @@ class Capture(AbstractSequence):
         import open3d as o3d
 
         drawn, size_m = self.factors, self.factors.size_m
-        parts = [(_OBJECT, self._mesh.vertices, self._mesh.triangles, self._motion[0][index])]
+        parts = [(_OBJECT, self.mesh.vertices, self.mesh.triangles, self._motion[0][index])]
         if drawn.support in ("table", "turntable"):
             table = _quad(([-5.0, -5.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0]), size_m)
             parts.append((_BELOW, *table, np.eye(4)))

@@ -11,15 +11,20 @@ from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.types import InputError, Step
+from modeler.evaluation import TrueSurface
+from modeler.types import Array, InputError, Step
 from studies.multiplied.judged import MAX_DEG, apart
 from studies.trust.study import built
 from studies.whole.capture import Capture
 from studies.whole.plan import Factors, Half, Plan
 from studies.whole.things import Thing, read
 
+_ALIKE: Final = 0.002
+"""Mean distance, as a share of the size, within which a turned mesh is the same: a fifth of what the finest captures
+resolve."""
 _POINTS: Final = 300
 """Of a view that are compared: errors of the surface are then known to a few per cent."""
 
@@ -120,7 +125,11 @@ def _read(path: Path) -> tuple[list[Thing], list[npt.NDArray[np.uint8]]]:
 
 
 def _errors(capture: Capture, step: Step) -> tuple[float | None, float | None]:
-    """Return the largest errors of a run's poses, in degrees and m; None with fewer than two."""
+    """Return the largest errors of a run's poses, in degrees and m; None with fewer than two.
+
+    Of the true poses that show the same surface, as those of a plain box turned by half a turn do, that nearest to the
+    one found counts.
+    """
     found = step.solution.trajectory
     if len(found) < 2:
         return None, None
@@ -129,4 +138,44 @@ def _errors(capture: Capture, step: Step) -> tuple[float | None, float | None]:
         index: rng.choice(step.views[index].points_m, min(_POINTS, len(step.views[index].points_m)), replace=False)
         for index in found
     }
-    return apart(found, {index: se3.inverse(pose) for index, pose in capture.truth().items()}, points_m)
+    truth = {index: se3.inverse(capture.truth()[index]) for index in found}
+    printed = capture.factors.colour == "photograph"
+    alike = [np.eye(4)] if printed else symmetries(capture.mesh.vertices, capture.mesh.triangles)
+    first = min(found)
+    object_from_model = found[first] @ se3.inverse(truth[first])
+    reference = {
+        index: min(
+            (turned @ truth[index] for turned in alike),
+            key=lambda pose, index=index: se3.rotation_angle(se3.inverse(object_from_model @ pose) @ found[index]),
+        )
+        for index in found
+    }
+    return apart(found, reference, points_m)
+
+
+def symmetries(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> list[Array]:
+    """Return the rotations (4, 4) by quarter and half turns about the middle that map a mesh onto itself.
+
+    Args:
+        vertices_m: (v, 3), upright.
+        triangles: (t, 3) vertex numbers.
+    """
+    import open3d as o3d
+
+    surface = TrueSurface.of(vertices_m, triangles, np.random.default_rng(0), 2000)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(vertices_m.astype(np.float32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
+    )
+    middle_m = 0.5 * (vertices_m.min(axis=0) + vertices_m.max(axis=0))
+    size_m = float(np.ptp(vertices_m, axis=0).max())
+    found = []
+    for rotation in Rotation.create_group("O").as_matrix():
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, middle_m - rotation @ middle_m
+        places_m = se3.transform(pose, surface.points_m).astype(np.float32)
+        off_m = scene.compute_distance(o3d.core.Tensor.from_numpy(places_m)).numpy()
+        if float(np.mean(off_m)) <= _ALIKE * size_m:
+            found.append(pose)
+    return found

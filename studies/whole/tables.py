@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
+
+import numpy as np
 
 from studies.results.tables import markdown
 from studies.whole.plan import Factors
@@ -47,7 +50,7 @@ FACTORS: Final[Mapping[str, Callable[[Factors], str]]] = MappingProxyType(
         "colour": lambda f: f.colour,
         "motion": lambda f: "told" if f.told else "not told",
         "intrinsics": lambda f: f.intrinsics,
-        "focal length off": lambda f: _FOCAL(abs(f.focal_error)),
+        "focal length, error": lambda f: _FOCAL(abs(f.focal_error)),
     }
 )
 """Names a capture's value of each factor."""
@@ -71,9 +74,15 @@ def counts(outcomes: Sequence[Outcome]) -> list[tuple[str | int, ...]]:
     """Return rows of `COLUMNS`: all captures, and those of every value of every factor."""
     rows = [("all", *_row(outcomes))]
     for factor, name in FACTORS.items():
-        for value in sorted({name(one.factors) for one in outcomes}):
+        for value in sorted({name(one.factors) for one in outcomes}, key=_by_number):
             rows.append((f"{factor}: {value}", *_row([one for one in outcomes if name(one.factors) == value])))
     return rows
+
+
+def _by_number(text: str) -> tuple[float, str]:
+    """Return a key that sorts ranges by their numbers, and what has none behind them."""
+    found = re.search(r"[\d.]+", text)
+    return (float(found[0]) if found else np.inf), text
 
 
 def _row(outcomes: Sequence[Outcome]) -> tuple[str | int, ...]:
