@@ -176,20 +176,21 @@ def _width_px(view: RayImage) -> float:
 def _inside(view: RayImage, pixels: np.ndarray, margin_px: float) -> np.ndarray:
     """Return which (n,) pixels (n, 2) are surface and some way from its outline."""
     far = ndimage.minimum_filter(_surface(view), size=2 * round(margin_px / 2.0) + 1)
-    return np.asarray(far[pixels[:, 0], pixels[:, 1]])
+    return np.asarray(far[pixels[:, 0], pixels[:, 1]], dtype=np.bool_)
 
 
 def _surface(view: RayImage) -> BoolArray:
     """Return where (h, w) a view has surface, without small holes."""
     surface = np.zeros(view.frame.depth_m.shape, dtype=np.bool_)
     surface[view.pixels[:, 0], view.pixels[:, 1]] = True
-    return np.asarray(ndimage.binary_closing(surface))
+    return np.asarray(ndimage.binary_closing(surface), dtype=np.bool_)
 
 
 def _outline(view: RayImage) -> Array:
     """Return columns and rows (n, 2) of the outline of a view's surface."""
     surface = _surface(view)
-    return np.argwhere(surface & ~ndimage.binary_erosion(surface))[:, ::-1].astype(np.float64)
+    inner = np.asarray(ndimage.binary_erosion(surface), dtype=np.bool_)
+    return np.argwhere(surface & ~inner)[:, ::-1].astype(np.float64)
 
 
 @final

@@ -153,9 +153,10 @@ def _frame(
 ) -> Frame:
     """Return one image of the body on its table; the camera of depth and colour is one."""
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(mesh.clone().transform(poses[0]))
-    board = o3d.geometry.TriangleMesh.create_box(0.7, 0.7, 0.01).translate((-0.35, -0.35, -0.01))
-    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(board).transform(poses[1]))
+    scene.add_triangles(mesh.clone().transform(o3d.core.Tensor(poses[0])))
+    board = o3d.geometry.TriangleMesh.create_box(0.7, 0.7, 0.01)
+    board.translate((-0.35, -0.35, -0.01))
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(board).transform(o3d.core.Tensor(poses[1])))
     offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     row, column = np.indices((camera.height, camera.width), dtype=np.float64)
 
