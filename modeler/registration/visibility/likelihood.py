@@ -289,7 +289,7 @@ class PairLikelihood:
             log_focal: (n,) logarithms of the focal lengths under which poses are scored, over that of the views; that
                 of the views if not given.
         """
-        band = 0 if self.colour is None else self.colour.scored_band(blur_m)
+        band = 0 if self.colour is None else self.colour.band(blur_m)
         found = self._summed(rows_under(poses, log_focal), blur_m, band, stride=stride, typical_misfit=typical_misfit)
         plain, share = stride * found[:, scores.LOG_LIKELIHOOD], stride * found[:, scores.EXPLAINED] / self.points
         if self.colour is None:
@@ -457,9 +457,31 @@ class PairLikelihood:
 
         They are those of squared distances, and of the squared differences of features that decrease correlations.
         """
+        of_surface, of_colours = self._curvatures(poses, blur_m, stride)
+        return of_surface + of_colours
+
+    def moved_by_shift(self, pose: Array, spread: Array, blur_m: float) -> Array:
+        """Return motions M (6, 2) ξ about the centre: of the mode if colours shift by one sd (method, eq. 7.6).
+
+        Args:
+            pose: (4, 4) the mode.
+            spread: (6, 6) root of the covariance of ξ, by surface, colours and prior.
+            blur_m: blur of the surfaces in m.
+        """
+        if self.colour is None:
+            return np.zeros((6, 2))
+        _, of_colours = self._curvatures(pose[None], blur_m, 1)
+        return np.asarray(spread @ (spread.T @ (of_colours[0] @ self.colour.shifts(pose))), dtype=np.float64)
+
+    def surface_curvature(self, pose: Array, blur_m: float) -> Array:
+        """Return the curvature (6, 6) of the surface's part of `tempered` by ξ about the centre, at a pose (4, 4)."""
+        return self._curvatures(pose[None], blur_m, 1)[0][0]
+
+    def _curvatures(self, poses: Array, blur_m: float, stride: int) -> tuple[Array, Array]:
+        """Return the parts (n, 6, 6) of `curvatures`: of surface, and of colours."""
         band, weight = 0, 0.0
         if self.colour is not None:
-            band = self.colour.scored_band(blur_m)
+            band = self.colour.band(blur_m)
             found = self._summed(rows(poses[:1]), blur_m, band, stride=1, typical_misfit=MISFIT)
             most = self.forward.model.max_independent_colours
             weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
@@ -470,7 +492,7 @@ class PairLikelihood:
                 rows(poses), self.surfaces(stride), colours, np.float32(weight), self.centre_m, blur_m
             )
         )
-        return stride * (self.temper * of_surface + of_colours)
+        return stride * self.temper * of_surface, stride * of_colours
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
         """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method, eq. 5.2)."""

@@ -37,8 +37,6 @@ _LEVEL = 1.0 / 255.0  # smallest change of a bright colour's logarithm in 8 bits
 _TRUNCATION = 3.0  # of a Gaussian, in standard deviations
 _CACHE: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # of `view_features`
 
-_MIN_WIDTH = 4.0
-"""Least width, in standard deviations of the colours' shift, of the bands by which samples are weighted."""
 ASSUMED_RHO = 0.7
 """Correlation assumed in descent."""
 _MAX_CORRELATION = 0.99
@@ -89,16 +87,6 @@ class PairColour:
     def independent(self, band: int, max_independent: float) -> float:
         """Return the number of independent features if all surface matches (method, eq. 7.3)."""
         return (1.0 - self.static_correlation(band) ** 2) / (1.0 / max_independent + 1.0 / self.patches(band))
-
-    def scored_band(self, blur_m: float) -> int:
-        """Return the index of the band by which samples are weighted."""
-        return max(self.band(blur_m), self._finest_scored)
-
-    @property
-    def _finest_scored(self) -> int:
-        """Index of the finest band by which samples are weighted, in which a shift of the colours has little effect."""
-        valid = int(np.ceil(np.log2(max(_MIN_WIDTH * self.target.sigma_colour_px / FINEST_PX, 1.0))))
-        return int(min(valid, BANDS - 1))
 
     def shifts(self, poses: Array) -> Array:
         """Return E (..., 6, 2), motions ξ that shift the target's colours by a standard deviation along both axes.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from modeler import se3
 from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
 from modeler.registration.systematic import of_multipath
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
@@ -136,6 +137,10 @@ class VisibilityRegistrar(AbstractRegistrar):
         nuisance = first_order(pair, found.poses[0], found.spreads[0], noise_m)
         proposal = MixtureProposal(density, gaussians)
         samples = self.sampler.run(proposal, likelihood, pair.centre_m, rng, nuisance=nuisance)
+        # The likelihood is that of aligned colours: an unknown shift moves samples as it moves the mode.
+        by_shift = pair.moved_by_shift(found.poses[0], found.spreads[0], noise_m)
+        shifts = rng.normal(size=(len(samples.poses), 2)) @ by_shift.T
+        samples = replace(samples, poses=se3.moved(samples.poses, shifts, pair.centre_m))
         return ModeSamples(samples, noise_m, typical_misfit)
 
     def _refined(

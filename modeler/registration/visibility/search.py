@@ -17,6 +17,7 @@ from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 _STRIDE = 2  # every second point is used for scores
 _COARSE_STRIDE = 8  # where the best pose need only be roughly right
+_SILENT = 0.1  # of the largest curvature: that of balls is 0.03, by the noise of normals
 OPEN_ROTATION_RAD = 1.0
 """Standard deviation of an open rotation: it is 1.33 if all are equally likely, 1.0 within limits of 130°."""
 
@@ -90,6 +91,8 @@ class Search:
     """Blur of the surfaces in the last stage of the descent, as a fraction of the object's size."""
     matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
     """Matches features for further starts, if the prior has more basins than `max_starts` reach."""
+    turns: int = 3000
+    """Number of poses along motions that surface leaves open whose colours are compared: 5° apart on a ball."""
     stages: int = 3
     """Stages of the descent, each with half the blur of the previous one."""
     steps: int = 4
@@ -167,10 +170,47 @@ class Search:
         started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
         if wanted > self.max_starts:
             started = np.concatenate([started, self._from_features(pair, density)])
-        poses, regulariser = started, self._regulariser(pair, prior)
-        for blur_m in self.blurs_m(pair):
-            poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
-        return started, poses
+        regulariser = self._regulariser(pair, prior)
+
+        def descended(poses: Array) -> Array:
+            for blur_m in self.blurs_m(pair):
+                poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
+            return poses
+
+        poses = descended(started)
+        turned = self._by_colour(pair, density, prior, poses, rng)
+        if not len(turned):
+            return started, poses
+        return np.concatenate([started, turned]), np.concatenate([poses, descended(turned)])
+
+    def _by_colour(
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        prior: PoseGaussian,
+        poses: Array,
+        rng: np.random.Generator,
+    ) -> Array:
+        """Return further starting poses (n, 4, 4) whose colours agree, along motions that surface leaves open.
+
+        Surface leads to one of the poses that it cannot distinguish, such as those of a ball; few of these have
+        colours within reach of a descent. Moves along them keep matching surface, so that many can be compared.
+        """
+        coarse_m = float(self.blurs_m(pair)[0])
+        if pair.colour is None:
+            return poses[:0]
+        best = poses[np.argmax(pair.tempered(poses, self.fine_m(pair), stride=_COARSE_STRIDE))]
+        extent = self.extent(pair)
+        scales, axes = np.linalg.eigh(pair.surface_curvature(best, coarse_m) * np.outer(extent, extent))
+        silent = axes[:, scales < _SILENT * scales[-1]]
+        if not silent.shape[1]:
+            return poses[:0]
+        spread = np.linalg.cholesky(silent.T @ (prior.covariance / np.outer(extent, extent)) @ silent)
+        moves = rng.normal(size=(self.turns, len(spread))) @ (silent @ spread).T * extent
+        moved = se3.moved(np.broadcast_to(best, (self.turns, 4, 4)), moves, pair.centre_m)
+        moved = moved[np.isfinite(density.log_prior(moved))]
+        colours = pair.scores(moved, coarse_m, stride=_COARSE_STRIDE).colours if len(moved) else np.zeros(0)
+        return moved[np.argsort(-colours, kind="stable")[: self.min_starts]]
 
     def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
