@@ -109,7 +109,7 @@ def test_an_object_is_found_and_followed_without_masks() -> None:
 @pytest.mark.parametrize("there", [True, False])
 def test_on_a_table_with_others_an_object_is_found_or_not_there(there: bool) -> None:
     sought, others = "stapler", ("whistle", "boot", "can")
-    shown = scene(sought if there else None, others, 3)
+    shown = scene(sought if there else None, others, 4)
     view = Viewpoint()
     found = Tracker(model_on_table(sought), Sensor(noise(view.distance_m, view))).update(shown.frame)
     if not there:

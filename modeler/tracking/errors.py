@@ -24,7 +24,7 @@ def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) ->
     outlines tell keeps other directions in place.
 
     Args:
-        seen: the model in the pose.
+        seen: the object in the frame.
         pose: camera_from_model, and the covariance C of ξ if the model is exact.
         renderer: of the model.
     """
