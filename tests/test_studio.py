@@ -115,6 +115,20 @@ def test_a_box_is_an_option_of_the_build_and_outlives_the_server(scan: Scan, sce
         scan.box((-20.0, -20.0), (-10.0, -10.0))
 
 
+def test_a_click_finds_the_object_again_after_a_wrong_box(scan: Scan) -> None:
+    mask = scan.mask(0)
+    assert mask is not None
+    row, column = (int(np.median(values)) for values in np.nonzero(mask))
+    scan.box((0.0, 0.0), (9.0, 9.0))
+    ready(scan)
+    assert not scan.mask(0).any()  # type: ignore[union-attr]
+    with pytest.raises(InputError, match="draw a box"):
+        scan.point_at(0, 2.0, 2.0)
+    scan.point_at(0, column, row)
+    assert scan.choices.roi is None
+    assert same(ready(scan).mask(0), mask)
+
+
 def test_command_lines_that_are_shown_are_understood(scan: Scan) -> None:
     (scan.folder / "run-1").mkdir()
     scan.choose_prior("turntable", 25.0, 3.0)

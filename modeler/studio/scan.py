@@ -28,7 +28,7 @@ from modeler.studio.capture import IDLE_S, Capture
 from modeler.studio.jobs import Job, Queue
 from modeler.studio.recorder import Recorder
 from modeler.system.regular_files import read_regular
-from modeler.types import BoolArray, InputError, Outcome, Segmentation
+from modeler.types import BoolArray, Camera, InputError, Outcome, Segmentation
 
 STATE: Final = "scan.json"
 """File of a scan's choices, by which its folder is known."""
@@ -172,7 +172,9 @@ class Scan:
         self.look()
 
     def point_at(self, frame: int, x: float, y: float) -> None:
-        """Say that the object is at a pixel: within the smallest box around it in which one is found that fits.
+        """Say that the object is at a pixel: it is looked for in the whole image, then in boxes around the pixel.
+
+        The first is taken in which an object is found there that does not reach the edge of the box.
 
         Raises:
             InputError: if none is found there.
@@ -184,17 +186,13 @@ class Scan:
         mask = self.mask(frame)
         if mask is not None and mask[row, column]:
             return
-        for share in _BOXES:
-            half = 0.5 * share * camera.width, 0.5 * share * camera.height
-            left, top = (max(0, int(at - side)) for at, side in zip((x, y), half, strict=True))
-            right, bottom = min(camera.width, int(x + half[0])), min(camera.height, int(y + half[1]))
-            segmenter = Segmenter(roi=(left, top, right, bottom))
-            shown = replace(image, mask=None)
-            inside = segmenter.segment(shown, segmenter.scene([shown])).mask
-            rim = inside[top, left:right].any() or inside[bottom - 1, left:right].any()
-            rim = rim or inside[top:bottom, left].any() or inside[top:bottom, right - 1].any()
-            if inside[row, column] and not rim:
-                self.box((left, top), (right - 1, bottom - 1))
+        frames = [self.sequence.frame(k) for k in scene_frames(self.sequence.indices)]
+        for roi in (None, *(_around(column, row, share, camera) for share in _BOXES)):
+            segmenter = Segmenter(roi=roi)
+            inside = segmenter.segment(image, segmenter.scene(frames)).mask
+            if inside[row, column] and not (roi is not None and _at_edge(inside, roi)):
+                self._choose(roi=roi)
+                self.look()
                 return
         raise InputError("no object stands out there; draw a box around it, or paint it")
 
@@ -445,6 +443,20 @@ class Scan:
 
     def _changed(self) -> None:
         self.version += 1
+
+
+def _around(column: int, row: int, share: float, camera: Camera) -> tuple[int, int, int, int]:
+    """Return the part of a box around a pixel that is in the image, its sides a share of the image's."""
+    half_x, half_y = (max(1, round(0.5 * share * side)) for side in (camera.width, camera.height))
+    left, top = max(0, column - half_x), max(0, row - half_y)
+    return left, top, min(camera.width, column + half_x), min(camera.height, row + half_y)
+
+
+def _at_edge(mask: BoolArray, roi: tuple[int, int, int, int]) -> bool:
+    """Return whether a mask (h, w) reaches the edge of a box."""
+    x0, y0, x1, y1 = roi
+    inside = mask[y0:y1, x0:x1]
+    return bool(inside[[0, -1]].any() or inside[:, [0, -1]].any())
 
 
 def runs_in(folder: Path) -> list[Path]:

@@ -28,7 +28,7 @@ from modeler.studio.guard import MOST_BYTES, Guard
 from modeler.studio.page import Page
 from modeler.studio.pictures import jpeg, thumbnail
 from modeler.studio.scan import Scan, Studio
-from modeler.system.regular_files import check_regular
+from modeler.system.regular_files import check_regular, read_regular
 from modeler.types import InputError
 from modeler.viz.viewer import Viewer, start_web
 
@@ -185,11 +185,11 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
         folder = _run(studio, name, run)
         if folder is None:
             return Response(status_code=404)
-        with tempfile.TemporaryDirectory() as place, contextlib.suppress(InputError):
-            out = Path(place) / "model.jpg"
-            thumbnail_of(folder, out)
-            if out.exists():
-                return _picture(out.read_bytes())
+        drawn, model = folder.with_name(f"{run}.jpg"), folder / "model.ply"
+        with contextlib.suppress(InputError, OSError):
+            if not drawn.exists() or drawn.stat().st_mtime_ns < model.stat().st_mtime_ns:
+                thumbnail_of(folder, drawn)
+            return _picture(read_regular(drawn))
         return Response(status_code=404)
 
     @app.get("/runs/{name}/{run}/{file}")
