@@ -28,7 +28,8 @@ from modeler.studio.guard import MOST_BYTES, Guard
 from modeler.studio.jobs import Job, Queue
 from modeler.studio.pictures import outline_svg, ring_svg, thumbnail, turns_deg
 from modeler.studio.recorder import Recorder
-from modeler.studio.scan import Scan, Studio, drawn
+from modeler.studio.scan import Scan, drawn
+from modeler.studio.state import Studio
 from modeler.types import BoolArray, Frame, InputError
 from studies.formats.image_folders import small_frames
 

@@ -40,8 +40,8 @@ class Studio:
 
         check_installed("nicegui", "NiceGUI", "studio")
         from modeler.runs.outputs import check_folder
-        from modeler.studio.scan import Studio as State
         from modeler.studio.server import serve
+        from modeler.studio.state import Studio as State
 
         if self.folder is not None and not self.folder.exists():
             raise InputError(f"{self.folder}: no such folder or file; give a capture, or a folder with captures")

@@ -15,7 +15,8 @@ from modeler.studio.check_step import CheckStep, ExportStep
 from modeler.studio.files_step import FilesStep, ScansStep
 from modeler.studio.jobs import Job
 from modeler.studio.object_step import ObjectStep
-from modeler.studio.scan import Scan, Studio
+from modeler.studio.scan import Scan
+from modeler.studio.state import Studio
 from modeler.studio.widgets import complain
 from modeler.types import InputError
 

@@ -27,7 +27,8 @@ from modeler.export import RunFolder
 from modeler.studio.guard import MOST_BYTES, Guard
 from modeler.studio.page import Page
 from modeler.studio.pictures import jpeg, thumbnail
-from modeler.studio.scan import Scan, Studio
+from modeler.studio.scan import Scan
+from modeler.studio.state import Studio
 from modeler.system.regular_files import check_regular, read_regular
 from modeler.types import InputError
 from modeler.viz.viewer import Viewer, start_web
