@@ -164,7 +164,8 @@ def test_staging_changes_what_the_condition_says(name: str) -> None:
     nearer_m, farther_m = (float(np.mean([pose[2, 3] for pose in s.truth().values()])) for s in (usual, other))
     assert farther_m - nearer_m == pytest.approx(0.3, abs=0.05)
     # Noise along the ray grows with the square of the distance.
-    assert other.sensor()[1] / usual.sensor()[1] == pytest.approx(2.0 * (1.1 / 0.8) ** 2, rel=0.02)
+    farther, nearer = (sequence.sensor().along_ray_m(1.0) for sequence in (other, usual))
+    assert farther / nearer == pytest.approx(2.0 * (1.1 / 0.8) ** 2, rel=0.02)
     assert not np.allclose(usual.truth()[0], RenderedSequence(staged(recipe, Condition(), frames=4, seed=8)).truth()[0])
 
 

@@ -114,7 +114,7 @@ def doubts_of(folder: Path, *, noise: float = 0.0, from_column: int = 0) -> list
         depth_m = depth_m * (1.0 + noise * rng.standard_normal(depth_m.shape).astype(np.float32))
         height, width = depth_m.shape
         camera = replace(frame.camera, width=width, height=height, cx=frame.camera.cx - from_column)
-        frames.append(Frame(frame.index, frame.time_s, depth_m, camera, None, None))
+        frames.append(Frame(frame.index, frame.time_s, depth_m.astype(np.float32), camera, None, None))
     write_bop(folder, frames)
     sequence = open_sequence(folder)
     return [*survey(sequence).doubts, *of_the_scene(sequence)]

@@ -171,7 +171,7 @@ def test_a_frame_is_thinned_to_pixels_of_the_same_rays() -> None:
 def striped(camera_from_model: Array) -> tuple[Frame, ModelRenderer]:
     """A photograph of a wide box with random stripes, and the renderer of its model."""
     box = trimesh.creation.box((0.3, 0.2, 0.1))
-    model = model_of(trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(box.vertices, box.faces, 0.004)))
+    model = model_of(trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(box.vertices, box.faces, 0.004)[:2]))
     stripes = np.random.default_rng(0).integers(20, 235, 400)
     grey = stripes[np.floor((model.vertices_m[:, 0] + model.vertices_m[:, 1]) / 0.006).astype(int)]
     renderer = ModelRenderer(replace(model, vertex_colours=np.repeat(grey[:, None], 3, axis=1).astype(np.uint8)))
