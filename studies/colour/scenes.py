@@ -153,17 +153,17 @@ def _frame(
 ) -> Frame:
     """Return one image of the body on its table; the camera of depth and colour is one."""
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(mesh.clone().transform(o3d.core.Tensor(poses[0])))
+    scene.add_triangles(mesh.clone().transform(o3d.core.Tensor.from_numpy(poses[0])))
     board = o3d.geometry.TriangleMesh.create_box(0.7, 0.7, 0.01)
     board.translate((-0.35, -0.35, -0.01))
-    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(board).transform(o3d.core.Tensor(poses[1])))
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(board).transform(o3d.core.Tensor.from_numpy(poses[1])))
     offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     row, column = np.indices((camera.height, camera.width), dtype=np.float64)
 
     def cast_rays(across: float, down: float) -> tuple[np.ndarray, dict[str, o3d.core.Tensor]]:
         x, y = (column + across - camera.cx) / camera.fx, (row + down - camera.cy) / camera.fy
         rays = np.stack([np.zeros_like(x)] * 3 + [x, y, np.ones_like(x)], axis=-1).astype(np.float32)
-        return rays, scene.cast_rays(o3d.core.Tensor(rays))
+        return rays, scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
 
     middle, colours = cast_rays(0.0, 0.0)[1], []
     depth_m, mask = middle["t_hit"].numpy().astype(np.float64), middle["geometry_ids"].numpy() == 0
