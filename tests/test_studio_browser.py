@@ -147,8 +147,7 @@ def test_a_capture_becomes_an_exported_model_which_a_second_page_shows_too(
         assert len(report["poses"]) == 5
         for number, step in enumerate(STEPS, start=1):
             window.page.keyboard.press(str(number))
-            window.page.locator(".panel:not(.hidden)").nth(0).wait_for()
-            assert window.page.get_by_role("tab", name=step, exact=True).get_attribute("aria-selected") == "true"
+            window.page.locator("[role=tab][aria-selected=true]", has_text=step).wait_for()
             assert window.faint() == []
             assert window.fits()
             other.click("tab", step)
