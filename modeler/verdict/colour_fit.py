@@ -34,8 +34,6 @@ _LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colo
 _FLIPS: Final = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0))
 _CHANCE_SDS: Final = 5.0  # of a correlation by chance: one of 10⁶ places, where several thousand are searched
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
-_PRIOR_PX, _PRIOR_LOG_SCALE = 2.0, 0.01  # sd of what an aligned image may be off, by hand
-_FINEST_PX, _MOVES = 0.1, 40  # last step of its estimate, and most steps
 _NORMAL_QUARTILE: Final = 0.6745  # median magnitude of a standard normal variable
 _AT_LEAST: Final = 0.5  # of the correlation elsewhere, and of that one: less is found by chance on few points
 
@@ -77,7 +75,7 @@ class Displacement:
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class ColourFit:
     """How well colours of the same surface agree in different views."""
 
@@ -87,10 +85,6 @@ class ColourFit:
     """The largest with colour displaced; that where colour is if no other place is significantly better."""
     displacement: Displacement
     """Where that is."""
-    near: Array
-    """(3,) estimate near alignment: shift of colour against depth in px, right and down, and logarithm of its scale."""
-    near_sigmas: Array
-    """(3,) their standard deviations."""
 
     @property
     def check(self) -> Check:
@@ -209,7 +203,7 @@ class _Comparison:
         best, elsewhere = here, correlation
         if correlation < _AT_LEAST:  # else no place is twice as good
             best, elsewhere = self._elsewhere(correlation)
-        return ColourFit(correlation, elsewhere, best, *self._near_alignment())
+        return ColourFit(correlation, elsewhere, best)
 
     @cached_property
     def width_px(self) -> float:
@@ -346,45 +340,3 @@ class _Comparison:
             else:
                 step_px *= 0.5
         return best, found
-
-    def _near_alignment(self) -> tuple[Array, Array]:
-        """Return shift in px and log scale (3,) near alignment, and their standard deviations (3,).
-
-        The mode of the pairs' evidence, of which each has as much as it has independent patches (eq. 7.3), times the
-        prior. The covariance is that of the scatter between pairs (Godambe 1960).
-        """
-        prior = np.array([_PRIOR_PX, _PRIOR_PX, _PRIOR_LOG_SCALE])
-        half_px = 0.25 * self.features(self.width_px).shape[2]
-        unit = np.array([1.0, 1.0, 1.0 / half_px])  # a pixel, at most, of what is seen
-        patches = np.diff(self._starts) * self._share_px / (4.0 * np.pi * self.width_px**2)
-
-        def evidence(at: Array) -> Array:
-            """Return the evidence (m, k) of the pairs for shifts and log scales (m, 3)."""
-            tried = [Displacement(float(np.exp(scale)), (x, y)) for x, y, scale in at]
-            found = np.clip(self.correlations(tried, self.width_px), 0.0, 0.99)
-            return np.asarray(-0.5 * patches * np.log1p(-(found**2)))
-
-        estimate, step_px = np.zeros(3), self.width_px
-        around = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        for _ in range(_MOVES):
-            near = estimate + step_px * around * unit
-            log_posterior = evidence(near).sum(axis=1) - 0.5 * np.sum((near / prior) ** 2, axis=1)
-            top = int(np.argmax(log_posterior))
-            if top == len(around) // 2:
-                if step_px <= _FINEST_PX:
-                    break
-                step_px *= 0.5
-            estimate = near[top]
-        steps = 0.5 * self.width_px * unit
-        forward, here, backward = (
-            evidence(estimate + sign * np.diag(steps)) if sign else evidence(estimate[None]) for sign in (1, 0, -1)
-        )
-        slopes = (forward - backward) / (2.0 * steps[:, None])
-        curvature = np.maximum(np.sum(2.0 * here - forward - backward, axis=1) / steps**2, 0.0)
-        posterior = 1.0 / (curvature + prior**-2.0)
-        return estimate, posterior * np.sqrt(np.sum(slopes**2, axis=1) + prior**-2.0)
-
-    @cached_property
-    def _share_px(self) -> float:
-        """Number of pixels of surface for each point."""
-        return float(np.mean([len(self.views[pair.second].pixels) for pair in self.pairs])) / _POINTS

@@ -23,7 +23,6 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.sequences import AbstractSequence, GivenSequence, open_sequence, survey
 from modeler.sequences.base import AbstractDerived
 from modeler.types import Array, Frame, InputError, Step
-from modeler.verdict.colour_fit import colour_fit
 from studies.colour.scenes import SIZES_PX, Scene
 
 Part = Literal["aligned", "displaced", "captures", "pairs"]
@@ -165,7 +164,6 @@ def _built(case: Case, data: Path) -> dict[str, Any]:
     began = time.perf_counter()
     *_, last = modeler.run(given, scene, closure_expected=closes)
     assert isinstance(last, Step)
-    fit = colour_fit(last.views, last.solution.trajectory)
     report = report_of(last, RunMeta(case.key, 0, "auto"))
     return {
         "before": "" if doubt is None else str(doubt),
@@ -173,7 +171,6 @@ def _built(case: Case, data: Path) -> dict[str, Any]:
         "codes": list(report["reason_codes"]),
         "reasons": list(report["reasons"]),
         "evidence": {name: [one["value"], one["limit"]] for name, one in report["evidence"].items()},
-        "near": None if fit is None else [fit.correlation, *fit.near, *fit.near_sigmas],
         "loop_sd": None if report["loop"] is None else report["loop"]["sigmas"],
         "placed": f"{len(last.solution.trajectory)} of {len(frames)}",
         "errors_deg": _errors_deg(last.solution.trajectory, truth),
