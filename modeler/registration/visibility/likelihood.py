@@ -471,7 +471,9 @@ class PairLikelihood:
         if self.colour is None:
             return np.zeros((6, 2))
         _, of_colours = self._curvatures(pose[None], blur_m, 1)
-        return np.asarray(spread @ (spread.T @ (of_colours[0] @ self.colour.shifts(pose))), dtype=np.float64)
+        shares, axes = np.linalg.eigh(spread.T @ of_colours[0] @ spread)  # of the information; no more than all of it
+        shifts = np.linalg.solve(spread, self.colour.shifts(pose))
+        return np.asarray(spread @ (axes * np.clip(shares, 0.0, 1.0)) @ axes.T @ shifts, dtype=np.float64)
 
     def surface_curvature(self, pose: Array, blur_m: float) -> Array:
         """Return the curvature (6, 6) of the surface's part of `tempered` by ξ about the centre, at a pose (4, 4)."""

@@ -138,7 +138,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         proposal = MixtureProposal(density, gaussians)
         samples = self.sampler.run(proposal, likelihood, pair.centre_m, rng, nuisance=nuisance)
         # The likelihood is that of aligned colours: an unknown shift moves samples as it moves the mode.
-        by_shift = pair.moved_by_shift(found.poses[0], found.spreads[0], noise_m)
+        by_shift = pair.moved_by_shift(found.poses[0], found.spreads[0], max(noise_m, self.search.fine_m(pair)))
         shifts = rng.normal(size=(len(samples.poses), 2)) @ by_shift.T
         samples = replace(samples, poses=se3.moved(samples.poses, shifts, pair.centre_m))
         return ModeSamples(samples, noise_m, typical_misfit)
