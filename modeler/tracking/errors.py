@@ -19,9 +19,9 @@ def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) ->
     """Return the covariance (6, 6) of ξ in camera_from_model · Exp(ξ) due to the model's errors.
 
     Point-to-plane distances have rows a = (p × n, n), with mean B of a aᵀ. If distances err by σ, alike within each of
-    K patches, a solution of covariance C is moved with the covariance (σ² / K) (s C) B (s C) (method, eq. 15.1). In the
-    direction in which surface tells most, it tells nearly all: 1 / s is the largest eigenvalue of C B. What colours and
-    outlines tell keeps other directions in place.
+    K patches, a solution from surface alone, of covariance C, is moved with the covariance (σ² / K) B⁻¹ = (σ² / K) s C.
+    In the direction in which surface tells most, it tells nearly all: 1 / s is the largest eigenvalue of C B. Places of
+    colours and outlines on the model err as its surface does, so that what they tell counts alike (method, eq. 15.1).
 
     Args:
         seen: the object in the frame.
@@ -37,8 +37,8 @@ def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) ->
     surface = rows.T @ rows / len(rows)
     about = se3.covariance_about(pose.covariance, renderer.centre_m)
     root = np.linalg.cholesky(about)
-    gain = about / np.linalg.eigvalsh(root.T @ surface @ root)[-1]
-    return se3.covariance_about(renderer.sigma_m**2 / PATCHES * gain @ surface @ gain.T, -renderer.centre_m)
+    scaled = about / np.linalg.eigvalsh(root.T @ surface @ root)[-1]
+    return se3.covariance_about(renderer.sigma_m**2 / PATCHES * scaled, -renderer.centre_m)
 
 
 def of_the_camera(camera_from_model: Array, centre_m: Array, sigma_focal: float, depth_scale_sigma: float) -> Array:

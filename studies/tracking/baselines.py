@@ -18,8 +18,8 @@ from modeler.types import Array, ObjectModel, RayImage
 
 _FITNESS: Final = 0.8  # of inliers, above which they say that the object is there: the best of a few tried
 _POINTS: Final = 20_000  # of the model's cloud
-_PAIRS: Final = (0.04, 0.05)  # sampling and distance steps of point pairs, in diameters: OpenCV's own example has them
-_SCENE_STEP: Final = 0.2  # every fifth point of the scene is a reference, as there
+_PAIRS: Final = (0.08, 0.05)  # sampling and distance steps of point pairs, in diameters; 5 s a frame, at 0.04 a minute
+_SCENE_STEP: Final = 0.2  # every fifth point of the scene is a reference: OpenCV's default
 _BEST: Final = 10  # of the poses of point pairs, refined
 _NEIGHBOURS: Final = 10  # of a point, from which small_gicp estimates its plane
 
