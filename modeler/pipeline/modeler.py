@@ -28,7 +28,6 @@ from modeler.types import (
     AbstractRegistrar,
     Edge,
     Event,
-    Failed,
     FocalLength,
     Frame,
     FrameRecord,
@@ -37,7 +36,6 @@ from modeler.types import (
     NotJoined,
     Posterior,
     RayImage,
-    Reason,
     Refining,
     Searching,
     Solution,
@@ -412,7 +410,7 @@ class Run:
         compact = [posterior.without_samples() for posterior in posteriors]
         edges = closer.judge(compact, placement, state.map_view, steps=state.steps(number, first))
         edges = tracker.explained(edges)
-        prepared = replace(prepared, view=view, left_out=_reason_left_out(prepared, edges, first=not state.views))
+        prepared = replace(prepared, view=view, left_out=prepared.why_left_out(edges, first=not state.views))
         state = state.joined(prepared, edges)
         if prepared.accepted and closer.is_keyframe(number, state.map_view):
             state = replace(state, keyframes=(*state.keyframes, number))
@@ -493,12 +491,3 @@ def _with_last(items: Iterable[T]) -> Iterator[tuple[T, bool]]:
             yield item, False
             item = following
         yield item, True
-
-
-def _reason_left_out(prepared: Prepared, edges: Sequence[Edge], *, first: bool) -> Reason | None:
-    """Return why a frame is left out; None if it is not."""
-    if prepared.view is None:
-        return Failed(prepared.failure)
-    if first or any(edge.accepted for edge in edges):
-        return None
-    return edges[0].reason

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
@@ -14,6 +14,8 @@ from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
     AbstractRegistrar,
+    Edge,
+    Failed,
     Frame,
     Outcome,
     Posterior,
@@ -50,6 +52,12 @@ class Prepared:
         """Why a frame has no view."""
         found = self.segmentation.outcome
         return Outcome.TOO_FEW_POINTS if found is Outcome.CONVERGED else found
+
+    def why_left_out(self, edges: Sequence[Edge], *, first: bool) -> Reason | None:
+        """Return why the frame is left out, by its edges; None if it is not. The first frame has no edge."""
+        if self.view is None:
+            return Failed(self.failure)
+        return None if first or any(edge.accepted for edge in edges) else edges[0].reason
 
     @property
     def accepted(self) -> bool:
