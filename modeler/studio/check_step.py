@@ -45,6 +45,8 @@ _EXPORTS: Final = {
     "nerfstudio": "nerfstudio: images, masks, cameras",
     "colmap": "COLMAP: images, masks, cameras",
 }
+_OF_CHECK: Final = ("edit", "report", "calibrate-camera", "suggest")
+"""Commands of the check."""
 _CAMERA: Final = {
     "Calibrate the camera, build again": None,
     "The focal length is right": "focal-length",
@@ -84,7 +86,8 @@ class CheckStep:
                     ui.html(ring_svg(report), sanitize=False)
                     plain_button("What next? Suggest a turn", lambda: self.page.run([scan.suggest_job()]))
                     quiet(scan.suggested())
-                command_line().text = f"modeler report {made}"
+                lines = [line for command, line in self.page.lines.items() if command in _OF_CHECK]
+                command_line().text = "\n".join(lines) or f"modeler report {made}"
                 main_button("Next: take it away", lambda: self.page.go("Take away"))
 
     def _pictures(self, address: str, report: Mapping[str, Any]) -> None:
@@ -196,8 +199,11 @@ class ExportStep:
                         link.props["download"] = name
                     for words in scan.export_words():
                         quiet(sentence(words))
-                command_line().text = f"modeler export {scan.run} --out {scan.name}.glb"
+                shown = self.page.lines.get("export", f"modeler export {scan.run} --out {scan.name}.glb")
+                self.line = command_line()
+                self.line.text = shown
 
     async def _export(self, scan: Scan, what: str) -> None:
         coloured = scan.sequence.frame(scan.sequence.indices[0]).colour is not None
         await self.page.run([scan.export_job(what, texture=coloured)])
+        self.line.text = self.page.lines["export"]

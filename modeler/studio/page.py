@@ -40,6 +40,7 @@ class Page:
         self.step = STEPS[0]
         self._seen = (-1, -1)
         self._job: Job | None = None
+        self.lines: dict[str, str] = {}  # that do the same as what was clicked, by command
         self._ended = studio.queue.last
 
     @property
@@ -124,6 +125,7 @@ class Page:
             if job.words[0] == "build":
                 sink = await run.io_bound(self.viewers.sink, job.words[job.words.index("--out") + 1])
                 job.unshown = () if sink is None else ("--connect", sink)
+        self.lines |= {job.words[0]: job.line for job in jobs}
         self.studio.queue.add(jobs)
 
     def _poll(self) -> None:

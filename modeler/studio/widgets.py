@@ -65,7 +65,7 @@ def command_line() -> ui.label:
     with ui.element("details").classes("card"):
         with ui.element("summary").classes("quiet"):
             ui.label("The same in a terminal").style("display: inline")
-        return ui.label().classes("line")
+        return ui.label().classes("line").style("white-space: pre-line")
 
 
 def embedded_viewer(address: str) -> None:
