@@ -11,7 +11,7 @@ from unittest import mock
 import numpy as np
 
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.visibility import likelihood, ridge
+from modeler.registration.visibility import directed, ridge
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.points import FixedPattern
 from modeler.types import Array, RayImage
@@ -141,8 +141,8 @@ REMOVED: Final = (
 def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
     """Return registrations with groups of constants times a factor, the most informative first."""
     hidden = 0.25 if factor < 1.0 else 0.75
-    silhouette = _module(likelihood, _SILHOUETTE_NOISE=0.5 * factor)
-    cosines = _module(likelihood, _COSINES=(factor * np.array([0.1, 0.35, 0.35, 0.6])).astype(np.float32))
+    silhouette = _module(directed, _SILHOUETTE_NOISE=0.5 * factor)
+    cosines = _module(directed, _COSINES=(factor * np.array([0.1, 0.35, 0.35, 0.6])).astype(np.float32))
     plain = {
         "independent points (300)": _scaled(factor, "likelihood.max_independent"),
         "cost of no overlap (50 nats)": _scaled(factor, "likelihood.no_overlap_cost"),

@@ -12,7 +12,8 @@ from modeler.kernels import mixture
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.features import FeatureMatcher
 from modeler.registration.posterior import MIN_MODE_SHARE, PRIOR_SAMPLES
-from modeler.registration.visibility.likelihood import MISFIT, PairLikelihood
+from modeler.registration.visibility.directed import MISFIT
+from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 _STRIDE = 2  # every second point is used for scores
