@@ -186,7 +186,7 @@ def test_register_gives_the_edge_that_build_finds(cli: Run, built: Path) -> None
 
 
 def test_build_fills_a_run_folder(built: Path) -> None:
-    assert {path.name for path in built.iterdir()} == FILES
+    assert {path.name for path in built.iterdir()} == FILES | {".pairs.done"}
     given = report(built)
     assert (given["schema"], given["seed"], given["prior"]) == (2, 0, "table")
     assert given["settings"] == {"method": "visibility", "colour": True, "voxel_m": 0.004, "every": 1, "frames": "0:3"}
@@ -220,7 +220,7 @@ def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(cli: Run, built: P
     refused = cli("build", BOX, "--out", folder, *QUICK)
     assert refused.status == 2
     assert (folder / "model.ply").read_text() == "an earlier model"
-    assert {path.name for path in folder.iterdir()} == FILES | {"notes.txt"}
+    assert {path.name for path in folder.iterdir()} == FILES | {"notes.txt", ".pairs.done"}
     assert cli("build", BOX, "--out", folder, *QUICK, "--overwrite").status == 0
     assert contents(folder) == contents(built)
     assert (folder / "notes.txt").read_text() == "the user's own"

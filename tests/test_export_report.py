@@ -119,7 +119,9 @@ def test_report_doubts_a_model_some_of_whose_frames_may_be_turned(tmp_path: Path
             spread = about_object @ spread @ about_object.T
             sure = step.solution.covariances
             covariances = {frame: sure[frame] + spread * (frame in frames) for frame in step.solution.trajectory}
-            return replace(step, solution=replace(step.solution, covariances=covariances))
+            motions = Solution().relative_covariance  # not known: poses are judged relative to the first frame
+            solution = replace(step.solution, covariances=covariances, relative_covariance=motions)
+            return replace(step, solution=solution)
 
         return change
 

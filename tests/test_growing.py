@@ -44,8 +44,10 @@ def test_frames_of_another_recording_find_their_places_on_a_model(grown: tuple[P
     poses = {pose["id"]: np.reshape(pose["object_from_camera"], (4, 4)) for pose in report["poses"]}
     assert [*poses] == [*range(COUNT), *new]
     base = poses[0] @ se3.inverse(grown[1][0])
-    for k, pose in poses.items():
-        assert np.degrees(se3.rotation_angle(se3.inverse(base @ grown[1][k]) @ pose)) < 2.5
+    for pose in report["poses"]:
+        error_rad = se3.rotation_angle(se3.inverse(base @ grown[1][pose["id"]]) @ poses[pose["id"]])
+        sigma_rad = np.sqrt(np.linalg.eigvalsh(np.reshape(pose["covariance"], (6, 6))[:3, :3])[-1])
+        assert error_rad < np.radians(1.0) + 2.0 * sigma_rad
     across = [edge for edge in report["edges"] if edge["source"] in new and edge["target"] < COUNT and edge["accepted"]]
     assert len(across) >= len(new)
     assert {edge["kind"] for edge in across} == {"closure"}

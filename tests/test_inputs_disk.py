@@ -100,10 +100,14 @@ def test_a_broken_input_leaves_the_run_of_before(scene: Path, built: Path, tmp_p
     shutil.copytree(built, tmp_path / "run")
     shutil.copytree(scene, tmp_path / "in")
     (tmp_path / "in" / "depth" / "000002.png").write_bytes(b"")
-    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+
+    def held() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+
+    before = held()
     for flag in ("--overwrite", "--resume"):
         assert main(["build", str(tmp_path / "in"), "--out", str(tmp_path / "run"), *QUICK, flag]) == 2
-    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+    assert held() == before
 
 
 @pytest.fixture

@@ -93,7 +93,9 @@ class Growth:
         part = replace(part, later_s=later_s(before, replace(before, report={"frames": times_s})))
         views = {k: part.view(k) for k in frames.indices}
         found = self._placed(known_object(run).model, part, [view for view in views.values() if view is not None])
-        placed = {one.frame: se3.inverse(one.pose.mean) for one in found if one.pose is not None and one.usable}
+        # How well a frame is placed, its edges say; only which pose of several it has, they do not.
+        certain = [one for one in found if one.outcome in ("found", "followed") and not one.modes]
+        placed = {one.frame: se3.inverse(one.pose.mean) for one in certain if one.pose is not None}
         new = {view.index: view for view in views.values() if view is not None and view.index in placed}
         edges = (*before.edges, *self._edges(before, new, placed))
         poses = before.solution.trajectory

@@ -373,7 +373,6 @@ TARGETS |= {
     "opencv": Target(_intrinsics("camera.yaml", _OPENCV), ("s/*.yaml",), read_all),
     "camera_info": Target(_intrinsics("camera_info.yaml", _CAMERA_INFO), ("s/*.yaml",), read_all),
     "nerfstudio": Target(_listed, ("s/transforms.json",), read_all, 2.0),
-    "record3d": Target(_record3d, ("s.r3d",), read_all),
     "stray scanner": Target(_stray, ("s/camera_matrix.csv", "s/confidence/*"), read_all),
     "npy": Target(_depth_as(".npy"), ("s/depth/*",), read_all),
     "npz": Target(_depth_as(".npz"), ("s/depth/*",), read_all),
@@ -407,6 +406,8 @@ TARGETS |= {
     "realsense 2.59": Target(_recorded("realsense-2.59.db3"), ("*.db3",), read_all),
     "realsense 2.59 yuyv": Target(_recorded("realsense-2.59-yuyv.db3"), ("*.db3",), read_all),
 }
+if importlib.util.find_spec("lzfse") is not None:
+    TARGETS["record3d"] = Target(_record3d, ("s.r3d",), read_all)
 if importlib.util.find_spec("av") is not None:
     TARGETS["mkv"] = Target(_kinect, ("s.mkv",), read_all, 0.5)
     TARGETS["k4arecord"] = Target(_recorded("kinect.mkv"), ("kinect.mkv",), read_all, 0.3)
