@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import re
@@ -131,13 +132,29 @@ def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
         timeout_graceful_shutdown=_CLOSE_S,
         server_header=False,
     )
-    announce(f"{address}/?token={token}")
     try:
-        uvicorn.Server(config).run(sockets=[listening])
+        _Server(config, lambda: announce(f"{address}/?token={token}")).run(sockets=[listening])
     finally:
         studio.queue.stop()
         studio.release()
         viewers.stop()
+
+
+@final
+class _Server(uvicorn.Server):
+    """One that says when it answers, and ends in order also if it is asked to while it starts."""
+
+    def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
+        uvicorn.Server.__init__(self, config)
+        self.announce = announce
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start; what has been started ends before the server does."""
+        await uvicorn.Server.startup(self, sockets)
+        if self.should_exit:
+            await self.shutdown(sockets)
+        else:
+            asyncio.get_running_loop().call_soon(self.announce)
 
 
 def _listening(port: int) -> socket.socket:
