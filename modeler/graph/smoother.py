@@ -177,8 +177,8 @@ class Smoother:
     def _covariance(self, independent: RelativeCovariance) -> RelativeCovariance | SharedCovariance:
         """Return covariances with the errors that edges share."""
         factors = independent.factors
-        told = self.shared or self.common or self.focal or self.variance_factor != 1.0
-        if not (factors and (told or self.common_shift_m2 is not None)):
+        stated = self.shared or self.common or self.focal or self.variance_factor != 1.0
+        if not (factors and (stated or self.common_shift_m2 is not None)):
             return independent
         parts = self.shared, self.common, self.focal, self.common_shift_m2, self.variance_factor
         return SharedCovariance(independent, factors, *parts)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 STEPS: Final = ("Files", "Capture", "Object", "Build", "Check", "Take away", "Scans")
 _WITHOUT_SCAN: Final = ("Files", "Capture", "Scans")
-_POLL_S: Final = 0.3
+_POLL_S: Final = 0.3  # between looks at what runs: words and bars need to be no fresher
 _STYLE: Final = Path(__file__).with_name("style.css")
 _DARK: Final = "background: #10343b"
 

@@ -17,7 +17,7 @@ from modeler.viz.images import outline
 
 THUMBNAIL_PX: Final = 80
 """Height of a small picture."""
-_JPEG_QUALITY: Final = 85
+_JPEG_QUALITY: Final = 85  # edges of masks are then free of visible blocks
 
 
 def picture(frame: Frame) -> npt.NDArray[np.uint8]:
