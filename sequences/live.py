@@ -173,6 +173,8 @@ ADVICE = f"a RealSense camera is read by its maker's library; {install_command('
 WARM_UP = 30
 """Images after which exposure has settled."""
 TIMEOUT_MS = 5000
+REACH_M = 16.0
+"""Depth of a live camera beyond this is a measurement error; less fits 16 bits of a fine unit."""
 _TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")
 """Names of models that measure so; others see structured light or stereo pairs."""
 

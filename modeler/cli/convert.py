@@ -13,9 +13,6 @@ from modeler.cli.console import say
 from modeler.cli.options import FrameOptions, InputOptions
 from modeler.composition.options import default
 
-LIVE_REACH_M = 16.0
-"""Depth of a live camera beyond this is a measurement error."""
-
 
 @dataclass(frozen=True)
 class Convert:
@@ -48,6 +45,7 @@ class Convert:
         from modeler.runs.outputs import check_files, check_folder, run_inputs
         from modeler.runs.reopening import calibrated
         from modeler.sequences import finest_unit_mm, frame_range, open_sequence, scene_meta, survey, write_bop
+        from modeler.sequences.live import REACH_M
         from modeler.system.regular_files import read_regular
         from modeler.types import InputError
 
@@ -70,7 +68,7 @@ class Convert:
         with reading() as watched:
             found = survey(watched(sequence.recorded(), "reading"))
             found.check(sequence.name, despite_doubts=self.given.despite_doubts)
-            farthest_m = LIVE_REACH_M if sequence.live else found.farthest_m
+            farthest_m = REACH_M if sequence.live else found.farthest_m
             unit_mm = finest_unit_mm(farthest_m)
             write_bop(
                 self.out,

@@ -6,17 +6,15 @@ import io
 import json
 import threading
 from pathlib import Path
-from typing import Final, final
+from typing import final
 
 import numpy as np
 from PIL import Image
 
 from modeler.export import write_atomically
 from modeler.sequences import AbstractSequence, finest_unit_mm
+from modeler.sequences.live import REACH_M
 from modeler.types import Frame, InputError
-
-REACH_M: Final = 16.0
-"""Depth beyond is a measurement error, as in `modeler convert`; what lies there fits no 16 bits of a fine unit."""
 
 
 @final
