@@ -15,6 +15,7 @@
 
 BIN := .venv/bin
 TWO := -n 2 --dist loadfile  # processes; kernels have threads of their own
+unexport PYTHONDONTWRITEBYTECODE  # containers often set it; without bytecode, each start of Python takes 2 s more
 
 .PHONY: setup demo test test-slow docs results calibrate trust ablation bench bench-gpu scale same audit
 
