@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, final
+from typing import Final, Literal, final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,6 @@ _LEAST_EDGES: Final = 12.0  # px at that size, mean over the frames
 
 
 Flip = Literal["", "mirrored", "upside down"]
-_FLIPS: Final[dict[Flip, tuple[slice, slice]]] = {
-    "": (slice(None), slice(None)),
-    "mirrored": (slice(None), slice(None, None, -1)),
-    "upside down": (slice(None, None, -1), slice(None, None, -1)),
-}
 
 
 @final
@@ -78,7 +73,8 @@ def misalignment(frames: Sequence[Frame]) -> Misalignment | None:
     pairs = [_edges(frame, frame.colour) for frame in frames if frame.colour is not None]
     if not pairs or np.mean([depth.sum() for depth, _ in pairs]) < _LEAST_EDGES:
         return None
-    still = _Search(pairs).correlation("", (1.0, 1.0))
+    search = _Search(pairs)
+    still = search.correlations((1.0, 1.0))[""]
     deviation, centre = float(still.std()), still.shape[0] // 2
     if deviation == 0.0:
         return None
@@ -87,8 +83,7 @@ def misalignment(frames: Sequence[Frame]) -> Misalignment | None:
     if aligned > _HIDDEN * deviation:
         plain = shifted.height > _SHIFTED * aligned and max(map(abs, shifted.shift)) > _LEAST_SHIFT
         return _result(frames[0], shifted, shifted, aligned / deviation) if plain else None
-    search = _Search(pairs)
-    tried = [_best(search.correlation(flip, scale), flip, scale) for flip in _FLIPS for scale in _scales()]
+    tried = [_best(found, flip, scale) for scale in _scales() for flip, found in search.correlations(scale).items()]
     best = max(tried, key=lambda each: each.height)
     plain = best.height > _BETTER * aligned and best.height > _PLAIN * best.deviation
     if not plain or (best.height < _STRONG and best.height < _CLEAR * best.deviation):
@@ -179,22 +174,40 @@ class _Search:
         self._depth = [depth for depth, _ in pairs]
         self._colour = [np.fft.rfft2(colour, self._size) for _, colour in pairs]
         self._norm = float(np.sqrt(np.mean([np.mean(colour**2) for _, colour in pairs]))) + 1e-12
+        down, across = (
+            np.exp(2j * np.pi * frequencies(2 * size) * (size - 1))
+            for size, frequencies in ((height, np.fft.fftfreq), (width, np.fft.rfftfreq))
+        )
+        self._phases = {"": 1.0, "mirrored": across, "upside down": down[:, None] * across}
 
-    def correlation(self, flip: Flip, scale: tuple[float, float]) -> Array:
-        """Return the correlation by shift, down and right, from minus to plus the reach."""
-        total, count = np.zeros(self._size), 1.0
+    def correlations(self, scale: tuple[float, float]) -> dict[Flip, Array]:
+        """Return the correlation by shift, down and right, from minus to plus the reach, for each way to flip.
+
+        An image turned by 180 degrees has the conjugate spectrum, but for a phase; a mirrored one that of the opposite
+        frequency across.
+        """
+        sums = {flip: np.zeros_like(self._colour[0]) for flip in get_args(Flip)}
+        count = 1.0
         for depth, colour in zip(self._depth, self._colour, strict=True):
-            flipped = depth[_FLIPS[flip]]
-            moved = flipped if scale == (1.0, 1.0) else self._resized(flipped, scale)
-            total += np.fft.irfft2(np.conj(np.fft.rfft2(moved, self._size)) * colour, self._size)
+            moved = depth if scale == (1.0, 1.0) else _resized(depth, scale)
+            spectrum = np.fft.rfft2(moved, self._size)
+            sums[""] += np.conj(spectrum) * colour
+            sums["mirrored"] += np.roll(spectrum[::-1], 1, axis=0) * colour
+            sums["upside down"] += spectrum * colour
             count += float(moved.sum())
         reach = round(_REACH * self._depth[0].shape[1])
-        return np.roll(total, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1] / (count * self._norm)
+        near = np.arange(-reach, reach + 1)
+        found: dict[Flip, Array] = {}
+        for flip, total in sums.items():
+            rows = np.fft.ifft(self._phases[flip] * total, axis=0)[near]
+            found[flip] = np.fft.irfft(rows, self._size[1], axis=1)[:, near] / (count * self._norm)
+        return found
 
-    def _resized(self, image: Array, scale: tuple[float, float]) -> Array:
-        """Return an image (h, w) with things of another size, by interpolation, about its middle."""
-        sources = [
-            (np.arange(size) - (size - 1) / 2) / factor + (size - 1) / 2
-            for size, factor in zip(image.shape, scale[::-1], strict=True)
-        ]
-        return np.asarray(ndimage.map_coordinates(image, np.meshgrid(*sources, indexing="ij"), order=1))
+
+def _resized(image: Array, scale: tuple[float, float]) -> Array:
+    """Return an image (h, w) with things of another size, across and down, by interpolation, about its middle."""
+    factors = 1.0 / np.array(scale[::-1])
+    middle = (np.array(image.shape) - 1) / 2
+    offset = middle - factors * middle
+    moved = ndimage.affine_transform(image, factors, offset, order=1)  # pyright: ignore[reportArgumentType]
+    return np.asarray(moved)

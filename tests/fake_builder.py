@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -11,7 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from modeler.batch.jobs import ENDED, Job, write_note
+from modeler.batch.jobs import ENDED, Processes, write_note
 from modeler.cli.one_job import begin, end_with_the_parent
 
 BOOK = "book.txt"
@@ -64,7 +65,9 @@ def wait_for(condition: Callable[[], object]) -> None:
         time.sleep(0.02)
 
 
-def build(job: Job) -> int:
+def build(words: str, say: Callable[[str], object]) -> int:
+    """Build the sequence of a job (JSON), and return the status with which a process would end."""
+    job, note = begin(words)
     given = json.loads((Path(job.sequence) / "given.json").read_text())
     (job.run / ".pairs").mkdir(parents=True, exist_ok=True)
     for pair in range(given["pairs"]):
@@ -79,21 +82,27 @@ def build(job: Job) -> int:
     failures = len(failed.read_text()) if failed.exists() else 0
     if failures < given["fails"]:
         failed.write_text("x" * (failures + 1))
-        os.abort()
-    if given["status"] in ENDED:
+        return -signal.SIGABRT
+    status = int(given["status"])
+    if status in ENDED:
         (job.run / "report.json").write_text("{}")
+        record = {"trustworthy": status == 0, "reasons": [] if status == 0 else ["made up"], "frames": 4}
+        write_note(job.note, {**note, "status": status, "record": record})
     else:
-        print(f"modeler: {job.sequence}: cannot be built", file=sys.stderr)
-    return given["status"]
+        say(f"modeler: {job.sequence}: cannot be built\n")
+    return status
+
+
+def run_here(_: Processes, command: list[str], environment: dict[str, str], log: int) -> int:
+    """Do in this process what `Processes.run` has another do."""
+    return build(command[-1], lambda line: os.write(log, line.encode()))
 
 
 def main() -> int:
     threading.Thread(target=end_with_the_parent, daemon=True).start()
-    job, note = begin(sys.argv[1])
-    status = build(job)
-    if status in ENDED:
-        record = {"trustworthy": status == 0, "reasons": [] if status == 0 else ["made up"], "frames": 4}
-        write_note(job.note, {**note, "status": status, "record": record})
+    status = build(sys.argv[1], sys.stderr.write)
+    if status < 0:
+        os.kill(os.getpid(), -status)
     return status
 
 

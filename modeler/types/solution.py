@@ -9,8 +9,6 @@ from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from modeler import se3
 from modeler.types.base import Array
@@ -267,10 +265,7 @@ def segments(edges: Sequence[Edge]) -> dict[int, int]:
     ends = _ends(edges)
     frames, indices = np.unique(ends, return_inverse=True)
     indices = indices.reshape(-1, 2)[np.array([edge.kind != "join" for edge in edges], dtype=bool)]
-    ones = np.ones(len(indices), dtype=np.int8)
-    count = len(frames)
-    labels = connected_components(coo_array((ones, (indices[:, 0], indices[:, 1])), (count, count)), directed=False)[1]
-    return dict(zip(frames.tolist(), labels.tolist(), strict=True))
+    return dict(zip(frames.tolist(), _labels(indices, len(frames)).tolist(), strict=True))
 
 
 def joined_without(edge: Edge, edges: Sequence[Edge]) -> bool:
@@ -287,9 +282,16 @@ def _ends(edges: Sequence[Edge]) -> npt.NDArray[np.int64]:
 def _parts(ends: npt.NDArray[np.int64], everything: npt.NDArray[np.int64]) -> int:
     """Return the number of connected components of the frames of `everything` (n, 2) under edges (m, 2)."""
     frames = np.unique(everything)
-    ends = np.searchsorted(frames, ends)
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(frames), len(frames)))
-    return int(connected_components(graph, directed=False)[0])
+    return len(set(_labels(np.searchsorted(frames, ends), len(frames)).tolist()))
+
+
+def _labels(ends: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int32]:
+    """Return the number (count,) of the connected component of each of `count` nodes under edges (m, 2)."""
+    from scipy.sparse import coo_array  # with which nouns alone take twice as long to import
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 @dataclass(frozen=True)
