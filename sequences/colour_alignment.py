@@ -9,6 +9,7 @@ from typing import Final, Literal, final, get_args
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
+from scipy.fft import next_fast_len
 
 from modeler.types import Array, Frame
 
@@ -170,13 +171,16 @@ class _Search:
 
     def __init__(self, pairs: Sequence[tuple[Array, Array]]) -> None:
         height, width = pairs[0][0].shape
-        self._size = 2 * height, 2 * width
+        self._reach = round(_REACH * width)
+        self._size = tuple(next_fast_len(size + self._reach, real=True) for size in (height, width))
         self._depth = [depth for depth, _ in pairs]
         self._colour = [np.fft.rfft2(colour, self._size) for _, colour in pairs]
         self._norm = float(np.sqrt(np.mean([np.mean(colour**2) for _, colour in pairs]))) + 1e-12
         down, across = (
-            np.exp(2j * np.pi * frequencies(2 * size) * (size - 1))
-            for size, frequencies in ((height, np.fft.fftfreq), (width, np.fft.rfftfreq))
+            np.exp(2j * np.pi * frequencies(padded) * (size - 1))
+            for size, padded, frequencies in zip(
+                (height, width), self._size, (np.fft.fftfreq, np.fft.rfftfreq), strict=True
+            )
         )
         self._phases = {"": 1.0, "mirrored": across, "upside down": down[:, None] * across}
 
@@ -195,8 +199,7 @@ class _Search:
             sums["mirrored"] += np.roll(spectrum[::-1], 1, axis=0) * colour
             sums["upside down"] += spectrum * colour
             count += float(moved.sum())
-        reach = round(_REACH * self._depth[0].shape[1])
-        near = np.arange(-reach, reach + 1)
+        near = np.arange(-self._reach, self._reach + 1)
         found: dict[Flip, Array] = {}
         for flip, total in sums.items():
             rows = np.fft.ifft(self._phases[flip] * total, axis=0)[near]

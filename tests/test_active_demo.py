@@ -28,10 +28,10 @@ def test_a_robot_turns_the_object_as_suggested_and_leaves_a_run(
 ) -> None:
     recipe, out = tmp_path / "step.json", tmp_path / "demo"
     recipe.write_text(json.dumps(RECIPE))
-    assert main(["--shape", str(recipe), "--actions", "2", "--out", str(out)]) in (0, 3)  # two turns are rarely enough
+    assert main(["--shape", str(recipe), "--actions", "1", "--out", str(out)]) in (0, 3)  # one turn is rarely enough
     assert "turn by " in capfd.readouterr().err
     report = json.loads((out / "run" / "report.json").read_text())
-    assert [frame["id"] for frame in report["frames"]] == [0, 1, 2]
+    assert [frame["id"] for frame in report["frames"]] == [0, 1]
     assert {path.name for path in (out / "run").iterdir()} >= FILES
     again = cli("suggest", out / "run")
     assert again.status == 0

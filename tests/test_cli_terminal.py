@@ -263,13 +263,13 @@ def test_a_program_that_calls_a_command_handles_its_signals_again(capfd: pytest.
     capfd.readouterr()
 
 
-def test_settings_for_developers_of_libraries_change_nothing(tmp_path: Path) -> None:
+def test_settings_for_developers_of_libraries_change_nothing(scene: Path, tmp_path: Path) -> None:
     settings = {"OPT": "9", "CPU_NAME": "nonsense", "THREADING_LAYER": "nonsense", "DEBUG": "1", "DUMP_IR": "1"}
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\nnum_threads: nonsense\n")
     said = []
     for place, changed in ((Path.cwd(), {}), (tmp_path, settings)):
         ended = subprocess.run(
-            [*COMMAND, "register", BOX, "0", "1", *QUICK],
+            [*COMMAND, "register", str(scene), "0", "1", *QUICK],
             cwd=place,
             env={**os.environ, **{f"NUMBA_{name}": value for name, value in changed.items()}, "RERUN": "nonsense"},
             capture_output=True,
@@ -390,9 +390,11 @@ def test_memory_that_does_not_suffice_for_libraries_is_said_in_one_line(limit_mb
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
 @pytest.mark.parametrize("limit_mb", [1500, pytest.param(3500, marks=pytest.mark.slow)])
-def test_memory_that_does_not_suffice_for_the_recording_is_said_in_one_line(limit_mb: int, tmp_path: Path) -> None:
+def test_memory_that_does_not_suffice_for_the_recording_is_said_in_one_line(
+    scene: Path, tmp_path: Path, limit_mb: int
+) -> None:
     limited = f'ulimit -v {1024 * limit_mb}; exec "$@"'
-    build = ["build", BOX, "--out", str(tmp_path / "run"), "--prior", "table", "--frames", "0:3"]
+    build = ["build", str(scene), "--out", str(tmp_path / "run"), "--prior", "table"]
     ended = subprocess.run(["sh", "-c", limited, "sh", *COMMAND, *build], capture_output=True, text=True, check=False)
     said = [line for line in ended.stderr.splitlines() if "compiling kernels" not in line]
     assert (ended.returncode, ended.stdout, len(said)) == (2, "", 1)

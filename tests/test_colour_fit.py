@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from modeler.verdict.colour_fit import Displacement, colour_fit
 ANGLES_DEG = [20.0 * k for k in range(8)]
 
 
+@cache
 def printed(contrast: float = 1.0, *, noise: float = 1.0) -> dict[int, RayImage]:
     """Return views of an ellipsoid with a print, before a wall with a pattern of its own."""
     rng, views = np.random.default_rng(5), views_of(ANGLES_DEG)

@@ -9,21 +9,20 @@ import pytest
 from command_runner import Run
 
 from modeler import se3
+from modeler.cli import main
 from modeler.runs.reopening import reopened
-from modeler.sequences import bundled
+from modeler.sequences import write_bop
 from modeler.types import Array
-
-BOX = bundled("box")
+from studies.formats.image_folders import small_frames
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of a few frames of the bundled box."""
-    from modeler.cli import main
-
-    run = tmp_path_factory.mktemp("edit") / "run"
-    main(["build", str(BOX), "--out", str(run), "--prior", "table", "--frames", "0:6", "--no-colour"])
-    return run
+    """A run of a few small frames of the bundled box."""
+    folder = tmp_path_factory.mktemp("edit")
+    write_bop(folder / "box", small_frames(5), depth_scale_mm=1.0)
+    main(["build", str(folder / "box"), "--out", str(folder / "run"), "--prior", "table", "--no-colour"])
+    return folder / "run"
 
 
 def poses(run: Path) -> dict[int, Array]:
@@ -63,7 +62,7 @@ def test_a_run_may_be_edited_in_place(cli: Run, built: Path, tmp_path: Path) -> 
     run = tmp_path / "run"
     shutil.copytree(built, run)
     report = json.loads((run / "report.json").read_text())
-    report["sequence"] = str(BOX)
+    report["sequence"] = str(built.parent / "box")
     (run / "report.json").write_text(json.dumps(report))
     last = max(poses(run))
     assert cli("edit", run, "--drop", str(last)).status in (0, 3)

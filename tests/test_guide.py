@@ -85,7 +85,9 @@ class Desk:
         if line in self.done or any(re.search(pattern, line) for pattern in NOT_HERE):
             return
         self.done.add(line)
-        words = [word for given in shlex.split(line)[1:] for word in _matching(given)]
+        words = [
+            word for given in shlex.split(line.replace("--idle-s 5", "--idle-s 1"))[1:] for word in _matching(given)
+        ]
         try:
             status = main(words)
         except SystemExit as ending:
@@ -110,6 +112,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Desk:
         (folder / "scans" / kind).mkdir(parents=True)
         for number in range(3):
             shutil.copy(bundled("box") / kind / f"{number:06d}.{suffix}", folder / "scans" / kind)
+    for step in steps(PAGES["README"]):
+        if isinstance(step, File):
+            written(folder, step)
     rng = np.random.default_rng(0)
     still = [_noisy(frames[0], number, rng) for number in range(5)]
     write_bop(folder / "still", still, depth_scale_mm=0.1)
@@ -142,13 +147,18 @@ def at_desk(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
             del sys.modules[name]
 
 
+def written(folder: Path, file: File) -> None:
+    path = folder / file.path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(file.text)
+
+
 def tried(desk: Desk, name: str) -> dict[str, Any]:
     """Do what a page says, in its order, and return the names of its Python."""
     names: dict[str, Any] = {}
     for step in steps(PAGES[name]):
         if isinstance(step, File):
-            Path(step.path).parent.mkdir(parents=True, exist_ok=True)
-            Path(step.path).write_text(step.text)
+            written(Path(), step)
         elif not isinstance(step, Command):
             exec(step.code, names)
         elif step.line.startswith("modeler "):
@@ -196,6 +206,7 @@ def test_the_guide_describes_every_key_of_a_report_and_no_other(built: Path) -> 
     assert [key for key in described if f'"{key}"' not in source and not re.search(rf"^    {key}:", source, re.M)] == []
 
 
+@pytest.mark.slow  # as `.ci/run` runs `make docs`
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="needs the extra docs")
     pytest.importorskip("mkdocstrings", reason="needs the extra docs")
