@@ -13,9 +13,9 @@ from segmentation_worlds import CAMERA, OBJECT, World, iou
 
 from modeler.segmentation import DepthNoise, Scene, Segmenter
 from modeler.segmentation.depth_images import (
+    change_at_rim,
     edge_of,
     mixed_pixels,
-    noise_ratio,
     noise_within,
     pieces,
     voxel_clusters,
@@ -240,6 +240,34 @@ def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rn
     judge(frames, masks, least=0.9)
     half_round = [replace(frame, depth_m=frame.depth_m[::-1, ::-1]) for frame in frames]  # hung upside down
     judge(half_round, [mask[::-1, ::-1] for mask in masks], least=0.9)
+
+
+def test_a_near_object_that_fills_half_of_the_image_is_not_taken_for_a_moving_camera(rng):
+    frames, masks = [], []
+    for k in range(8):
+        world = World(distance_m=0.45).table()
+        frame, mask = world.box((0.0, 0.0, 0.1), (0.13, 0.1, 0.1), turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
+        frames.append(frame)
+        masks.append(mask)
+    assert np.mean([mask.mean() for mask in masks]) > 0.4
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert not scene.camera_moves
+    assert scene.plane is not None
+    for frame, mask in zip(frames, masks, strict=True):
+        assert iou(segmenter.segment(frame, scene).mask, mask) > 0.9
+
+
+def test_the_middle_of_a_hanging_object_that_turns_slowly_is_part_of_it(rng):
+    """Depth changes there by less than its noise, and nothing carries the object."""
+    frames, masks = [], []
+    for k in range(8):
+        world = World().box((0.0, 0.6, 0.0), (2.0, 0.01, 2.0))
+        frame, mask = world.box((0.0, 0.0, 0.0), (0.12, 0.05, 0.07), turn_deg=3.0 * k, label=OBJECT).frame(k, rng)
+        frames.append(frame)
+        masks.append(mask)
+    for one in judge(frames, masks):
+        assert one.plane is None
 
 
 @pytest.mark.parametrize("step_deg", [1.0, 5.0, 30.0])
@@ -562,8 +590,8 @@ def test_noise_of_a_camera_that_stands_still_is_as_large_within_frames_as_betwee
     moving = [
         (tilted_m + 0.015 * k + rng.normal(0.0, 0.001, tilted_m.shape)).astype(np.float32) for k in rng.permutation(9)
     ]
-    assert 0.5 < noise_ratio(still, camera, noise) / noise_within(still, camera, noise) < 1.5
-    assert noise_ratio(moving, camera, noise) / noise_within(moving, camera, noise) > 4.0
+    assert 0.5 < change_at_rim(still, camera, noise) / noise_within(still, camera, noise) < 1.5
+    assert change_at_rim(moving, camera, noise) / noise_within(moving, camera, noise) > 4.0
     noisier = noise.times(6.0, 0.7)
     assert noisier.sigma_m(np.array(0.7)) == pytest.approx(6.0 * noise.sigma_m(np.array(0.7)))
     assert noisier.sigma_m(np.array(0.2)) < 2.0 * noise.sigma_m(np.array(0.2))

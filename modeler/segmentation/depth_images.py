@@ -21,6 +21,8 @@ HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an im
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
 _APART_PX = 4  # of the downsampled image: blocks that stereo matches are as wide
 _OUTLIERS_IN = 7  # one measurement in this many may be false; where more lie before the background, something moved
+_RIM_SHARE = 0.05  # of the image's width: wide enough for second differences of pixels that are `_APART_PX` apart
+_FREE_RIM = 0.4  # share of the rim that a near object and the arm that holds it leave free
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
 Labels = npt.NDArray[np.int32]
 _JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
@@ -77,19 +79,8 @@ class Layers:
 
     @property
     def changes_widely(self) -> bool:
-        """Whether much of the image changes: the camera moves, depth is noisier than expected, or people walk past."""
-        return bool(np.count_nonzero(self.moved) > MOST * self._seen)
-
-    @property
-    def camera_moves(self) -> bool:
-        """Whether much of the image changes, and often: who walks past changes each pixel in few of the frames."""
-        often = float(self.front_share[self.moved].sum()) > MOST**2 * self._seen
-        return self.changes_widely and often
-
-    @property
-    def _seen(self) -> int:
-        """Number of pixels with a background."""
-        return max(1, int(np.count_nonzero(np.isfinite(self.back_m[..., 2]))))
+        """Whether much of the image changes: the camera moves, noise is larger than expected, or the object is near."""
+        return bool(np.count_nonzero(self.moved) > MOST * np.count_nonzero(np.isfinite(self.back_m[..., 2])))
 
 
 def planning_stride(camera: Camera) -> int:
@@ -133,22 +124,25 @@ def separate_layers(depths_m: Sequence[Float32Array], camera: Camera, noise: Dep
     return Layers(back, front, rays, moved, still, share)
 
 
-def noise_ratio(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
-    """Return the ratio of the depth's spread over the frames at a pixel to `noise`: the median over all pixels.
+def change_at_rim(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
+    """Return the ratio of the depth's spread over frames to `noise` that most of the image's rim exceeds.
+
+    Most is all but what a near object leaves free there, and no less than that of the whole rim: before nothing, an arm
+    that holds the object is all that the rim shows.
 
     Args:
         depths_m: (n of (h, w), NaN = no measurement) of a camera that may stand still.
         camera: the camera.
         noise: what is expected of it.
     """
-    stack, readings = _sorted(depths_m, planning_stride(camera))
-    often = readings > _FEW_FRAMES
-    if not often.any():
-        return 1.0
+    stack, readings = _sorted([at_rim(depth_m) for depth_m in depths_m], planning_stride(camera))
+    often = readings > MOST * len(stack)
     quarters = [(np.float32(share) * (readings - 1)).round().astype(np.int64) for share in (0.25, 0.5, 0.75)]
     low, middle, high = (np.take_along_axis(stack, place[None], axis=0)[0][often] for place in quarters)
     apart = 2.0 * ndtri(0.75)  # standard deviations from the lower to the upper quartile of a Gaussian
-    return float(np.median((high - low) / (apart * noise.sigma_m(middle))))
+    spread = np.sort((high - low) / (apart * noise.sigma_m(middle)))[::-1]
+    least = max((1.0 - _FREE_RIM) * len(spread), _FREE_RIM * np.count_nonzero(_rim(often.shape)))
+    return float(spread[int(least)]) if least < len(spread) else 0.0
 
 
 def noise_within(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
@@ -171,6 +165,18 @@ def noise_within(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthN
         ratios.append(bent[np.isfinite(bent)])
     bent = np.concatenate(ratios)
     return float(np.median(bent) / (np.sqrt(6.0) * ndtri(0.75))) if len(bent) else 1.0
+
+
+def at_rim(depth_m: Float32Array) -> Float32Array:
+    """Return a depth image (h, w) with NaN elsewhere than at its rim."""
+    return np.where(_rim(depth_m.shape), depth_m, np.float32(np.nan))
+
+
+def _rim(shape: tuple[int, ...]) -> BoolArray:
+    """Return the pixels at the rim of an image of a shape (h, w)."""
+    rim, margin = np.ones(shape, dtype=np.bool_), max(1, round(_RIM_SHARE * shape[1]))
+    rim[margin:-margin, margin:-margin] = False
+    return rim
 
 
 def _sorted(depths_m: Sequence[Float32Array], stride: int) -> tuple[Float32Array, npt.NDArray[np.int64]]:

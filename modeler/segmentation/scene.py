@@ -245,7 +245,6 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
     labels = pieces(back, above)
     touching = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1)
     outside = touching >= _TOUCHING_PX
-    outside |= support is None
     outside[0] = False
     depth = np.where(outside[labels], back, np.float32(np.inf))
     for plane in planes:

@@ -12,7 +12,8 @@ from modeler.segmentation.background_colour import BackgroundColour, without_bac
 from modeler.segmentation.depth_images import (
     MOST,
     DepthNoise,
-    noise_ratio,
+    at_rim,
+    change_at_rim,
     noise_within,
     planning_stride,
     point_image,
@@ -25,12 +26,9 @@ from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, P
 from modeler.views.range_noise import RangeNoise, range_noise
 from modeler.views.sparsity import closed, gap_px, interpolated, measured_share
 
-_NOISIEST = 4.2
-"""Largest ratio to the expected noise; where depth changes more from frame to frame, the camera moves: between 3.0 of a
-first Kinect at 2 to 3 m and 5.7 of a camera moved by hand, 27 of one in large steps."""
 _CHANGES = 2.0
-"""Largest ratio of the spread from frame to frame to the noise within frames, where this is large: noise of a camera
-that stands still is the same in both to its fixed pattern, which only lowers it."""
+"""Largest ratio of the spread from frame to frame to the noise within frames at the image's rim, where this is at least
+the expected one: noise of a camera that stands still is the same in both to its fixed pattern, which only lowers it."""
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 
@@ -159,13 +157,13 @@ class Segmenter:
         camera, depths_m, noise = frames[0].camera, [_measured(frame) for frame in frames], self.noise
         layers, noisier = separate_layers(depths_m, camera, noise), None
         if layers.changes_widely:
-            factor = noise_ratio(depths_m, camera, noise)
-            if factor > max(_NOISIEST, _CHANGES * noise_within(depths_m, camera, noise)):
+            rims_m = [at_rim(depth_m) for depth_m in depths_m]
+            within = max(1.0, noise_within(rims_m, camera, noise))
+            if change_at_rim(depths_m, camera, noise) > _CHANGES * within:
                 return Scene(camera_moves=True)
-            noisier = noise = noise.times(max(factor, 1.0), float(np.nanmedian(depths_m)))
-            layers = separate_layers(depths_m, camera, noise)
-        if layers.camera_moves:
-            return Scene(camera_moves=True)
+            if np.isfinite(rims_m).any():
+                noisier = noise = noise.times(within, float(np.nanmedian(rims_m)))
+                layers = separate_layers(depths_m, camera, noise)
         stride = planning_stride(camera)
         allowed = self._allowed(layers.front_m[..., 2], stride)
         scene = learn(layers, allowed, noise, least_points=self.min_points / stride**2)
