@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -16,12 +17,15 @@ from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import Overrides, WatchLimits
 from modeler.sequences.base import FIRST
 from modeler.sequences.watch import arriving
+from modeler.studio.aiming import ghost, is_filled, nothing_near, suggested_turn_deg, too_far
 from modeler.studio.jobs import Job
-from modeler.types import BoolArray, Frame, InputError, Outcome, Segmentation
+from modeler.types import BoolArray, Frame, InputError, Outcome, Segmentation, SensorNoise
+from modeler.views import Sensor
 
 IDLE_S: Final = 600.0
 """A person who turns an object by hand, and is called away, takes so long at most."""
 _LEARNT_FROM: Final = 12  # frames; the segmenter asks for about a dozen
+_SENSOR: Final = Sensor(SensorNoise(sigma_r_m=None))  # noise of an unknown camera: a share of the distance
 _END_PX: Final = (5, 250)  # colours beyond are black or saturated, whatever was there
 
 
@@ -40,6 +44,9 @@ class Capture:
         """Number of frames so far."""
         self.fault = ""
         """Why nothing can be read."""
+        self.kept: dict[int, tuple[Frame, BoolArray]] = {}
+        """The newest frames in which the object was found, with its masks, by frame number."""
+        self._too_far = ""
         self._came_s = time.monotonic()
         self._scene = Scene()
         self._stopped = threading.Event()
@@ -86,6 +93,14 @@ class Capture:
         found = []
         if self.found is not None and self.found.outcome is not Outcome.CONVERGED:
             found.append(f"{self.found.outcome.label}: {self.found.outcome.advice}".replace("`", ""))
+        if self.frame is not None and (self.mask is None or not self.mask.any()) and nothing_near(self.frame.depth_m):
+            found.append("the middle of the image has no depth: too close, or shiny, dark or transparent")
+        if self.frame is not None and is_filled(self.frame.depth_m):
+            found.append(
+                "hole filling seems on: depth has no holes, not even beside edges; switch it off in the camera"
+            )
+        if self._too_far:
+            found.append(self._too_far)
         if self._scene.camera_moves:
             found.append("the camera seems to move; keep it still")
         if self._scene.arms:
@@ -111,6 +126,12 @@ class Capture:
         suggested = [line for _, _, line in self.job.messages() if line.startswith(("next: ", "nothing more"))]
         return suggested[-1] if suggested else ""
 
+    def ghost(self) -> BoolArray | None:
+        """Return where the object (h, w) will be after the turn that the build suggests; None if it suggests none."""
+        turn_deg, report = suggested_turn_deg(self.next()), self.report()
+        kept = dict(self.kept)
+        return None if turn_deg is None or report is None or not kept else ghost(kept, report, turn_deg)
+
     def _follow(self) -> None:
         """Take the frames as they come."""
         kept: list[Frame] = []
@@ -121,6 +142,15 @@ class Capture:
                 if self.count >= FIRST and self.count <= _LEARNT_FROM:
                     self._scene = Segmenter().scene(kept)
                 self.found = Segmenter().segment(frame, self._scene) if self.count >= FIRST else None
+                if self.found is not None and self.found.mask.any():
+                    self._found(frame, self.found.mask)
                 self.frame, self._came_s = frame, time.monotonic()
         except InputError as error:
             self.fault = str(error).replace("`", "")
+
+    def _found(self, frame: Frame, mask: BoolArray) -> None:
+        """Keep a frame in which the object was found."""
+        newest = [*self.kept.items()][1 - _LEARNT_FROM :]
+        self.kept = {**dict(newest), frame.index: (frame, mask)}
+        view = _SENSOR.ray_image(replace(frame, mask=mask))
+        self._too_far = too_far(view) if len(view.points_m) else ""

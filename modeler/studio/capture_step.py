@@ -10,7 +10,7 @@ from nicegui import run, ui
 
 from modeler.studio.capture import Capture
 from modeler.studio.jobs import Job
-from modeler.studio.pictures import outline_svg, ring_svg
+from modeler.studio.pictures import ghost_svg, outline_svg, ring_svg
 from modeler.studio.widgets import (
     PRIORS,
     command_line,
@@ -141,7 +141,7 @@ class CaptureStep:
         self.light.classes(replace=f"card {'' if placed is None else 'good' if placed else 'bad'}")
         if capture.count and recorder is None:
             self.live.set_source(f"/capture/newest.jpg?v={capture.count}")
-            self.live.set_content(outline_svg(capture.mask))
+            self.live.set_content(outline_svg(capture.mask) + ghost_svg(capture.ghost()))
         if (report := capture.report()) is not None:
             self.ring.set_content(ring_svg(report))
         if placed is not None:

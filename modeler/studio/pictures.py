@@ -52,13 +52,26 @@ def outline_svg(mask: BoolArray | None) -> str:
     """Return the outline of a mask (h, w) as SVG in px of the image; nothing without a mask."""
     if mask is None:
         return ""
-    steps = "".join(f"M{x0:g} {y0:g}L{x1:g} {y1:g}" for (x0, y0), (x1, y1) in outline(mask))
+    steps = _lines(mask)
     red, green, blue = OUTLINE_RGB
     style = "fill='none' vector-effect='non-scaling-stroke'"
     return (
         f"<path d='{steps}' {style} stroke='black' stroke-width='4' opacity='0.5'/>"
         f"<path d='{steps}' {style} stroke='rgb({red},{green},{blue})' stroke-width='2'/>"
     )
+
+
+def ghost_svg(mask: BoolArray | None) -> str:
+    """Return the outline of where the object (h, w) should be next, as SVG; nothing without one."""
+    if mask is None:
+        return ""
+    style = "fill='none' stroke='white' stroke-width='1.5' opacity='0.8' vector-effect='non-scaling-stroke'"
+    return f"<path d='{_lines(mask)}' {style}><title>the next view</title></path>"
+
+
+def _lines(mask: BoolArray) -> str:
+    """Return the outline of a mask (h, w) as the lines of an SVG path."""
+    return "".join(f"M{x0:g} {y0:g}L{x1:g} {y1:g}" for (x0, y0), (x1, y1) in outline(mask))
 
 
 def stroke_svg(points: list[tuple[float, float]], radius_px: float, *, add: bool) -> str:
