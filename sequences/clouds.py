@@ -10,9 +10,9 @@ import os
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, final
+from typing import BinaryIO, Final, Literal, final
 
 import numpy as np
 import numpy.typing as npt
@@ -46,8 +46,8 @@ class CloudSequence(AbstractRecording):
     """Source of the unit."""
     camera: Camera
     """The camera."""
-    backward: bool = False
-    """Whether y points up and z backward, as viewers have it."""
+    axes: Axes = "camera"
+    """Of the coordinates."""
     is_organised: bool = True
     """Whether each cloud has a point a pixel."""
     remarks: tuple[str, ...] = ()
@@ -78,7 +78,7 @@ class CloudSequence(AbstractRecording):
                 f"{path}: has {cloud.size[0]} x {cloud.size[1]} points where the first cloud has "
                 f"{size[1]} x {size[0]}; all clouds of a sequence must have one size."
             )
-        points = cloud.points * (_TURNED if self.backward else 1.0)
+        points = cloud.points @ _CAMERA_FROM[self.axes].T
         z_m = points[:, 2] * (self.unit_mm / 1000.0)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             columns = np.rint(points[:, 0] / points[:, 2] * camera.fx + camera.cx)
@@ -111,7 +111,18 @@ class CloudSequence(AbstractRecording):
         return self.remarks
 
 
-_TURNED = np.array([1.0, -1.0, -1.0])
+Axes = Literal["camera", "viewer", "body"]
+_CAMERA_FROM: Final[Mapping[Axes, Array]] = {
+    "camera": np.eye(3),
+    "viewer": np.diag([1.0, -1.0, -1.0]),
+    "body": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+}
+"""Rotations (3, 3) into the camera frame: x right, y down, z forward."""
+_SAID: Final[Mapping[Axes, tuple[str, ...]]] = {
+    "camera": (),
+    "viewer": ("y points up and z backward, as viewers have it: both are turned around",),
+    "body": ("x points forward and z up, as body frames of ROS have it: turned to those of a camera",),
+}
 
 
 def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
@@ -123,38 +134,67 @@ def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
     found = list_images(path, SUFFIXES) if path.is_dir() else {path.stem: path}
     numbers = frame_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
     clouds = dict(sorted((numbers[stem], cloud) for stem, cloud in found.items()))
-    first_path, remarks = next(iter(clouds.values())), []
-    first = _read(first_path)
-    ahead = np.count_nonzero(first.points[:, 2] > _LEAST_Z)
-    backward = bool(np.count_nonzero(first.points[:, 2] < -_LEAST_Z) > _BACKWARD * max(ahead, 1))
-    if backward:
-        remarks.append("y points up and z backward, as viewers have it: both are turned around")
-    unit_mm, who = _unit_mm(first, overrides)
+    first_path = next(iter(clouds.values()))
+    first, refused = _read(first_path), list[InputError]()
+    for axes in _plausible_axes(first.points):
+        turned = replace(first, points=first.points @ _CAMERA_FROM[axes].T)
+        try:
+            (intrinsics, columns, rows), remarks = _intrinsics(path, clouds, turned, axes, overrides)
+        except InputError as error:
+            refused.append(error)
+            continue
+        camera, (unit_mm, who) = Camera(columns, rows, *intrinsics), _unit_mm(turned, overrides)
+        return CloudSequence(path, clouds, unit_mm, who, camera, axes, first.size[1] > 1, (*_SAID[axes], *remarks))
+    raise refused[0]
+
+
+def _plausible_axes(points: npt.NDArray[np.float64]) -> list[Axes]:
+    """Return the axes by which nearly all points (n, 3) lie before the camera, and those of a camera."""
+    found = list[Axes]()
+    for axes, rotation in _CAMERA_FROM.items():
+        forward = points @ rotation[2]
+        if np.count_nonzero(forward > _LEAST_Z) > _BEFORE * max(np.count_nonzero(forward < -_LEAST_Z), 1):
+            found.append(axes)
+    return found if "camera" in found else [*found, "camera"]
+
+
+def _intrinsics(
+    path: Path, clouds: Mapping[int, Path], first: _Cloud, axes: Axes, overrides: Overrides
+) -> tuple[tuple[Intrinsics, int, int], tuple[str, ...]]:
+    """Return intrinsics, width and height of the camera that saw the clouds, and their source in words.
+
+    Args:
+        path: of the folder, or of the only cloud.
+        clouds: by frame number.
+        first: the first of them, in camera coordinates.
+        axes: of the files.
+        overrides: values that take precedence.
+
+    Raises:
+        InputError: if they are not known.
+    """
     intrinsics, columns, rows = overrides.intrinsics, *first.size
+    first_path = next(iter(clouds.values()))
     if rows > 1:
-        if intrinsics is None:
-            points = first.points.reshape(rows, columns, 3) * (_TURNED if backward else 1.0)
-            intrinsics = fit_intrinsics(points, first_path)
-            remarks.append("intrinsics are fitted to the points of the first cloud")
-    else:
-        whole, known = True, find_intrinsics(path, overrides) if path.is_dir() else None
-        intrinsics = known.intrinsics if intrinsics is None and known is not None else intrinsics
-        pixels = _image_coordinates(first_path) if intrinsics is None else None
-        if pixels is not None:
-            intrinsics = _fitted(first.points * (_TURNED if backward else 1.0), pixels, first_path)
-            remarks.append("intrinsics are fitted to the image coordinates (imX, imY) of the first cloud's points")
-        if intrinsics is None:
-            intrinsics = _on_a_grid(_slopes(first, backward=backward), first_path)
-            whole = False
-            remarks.append("intrinsics are recovered: the points lie on the rays of a grid of pixels")
-        intrinsics, columns, rows = _window(clouds, intrinsics, backward=backward, whole=whole)
-    return CloudSequence(
-        path, clouds, unit_mm, who, Camera(columns, rows, *intrinsics), backward, first.size[1] > 1, tuple(remarks)
-    )
+        if intrinsics is not None:
+            return (intrinsics, columns, rows), ()
+        fitted = fit_intrinsics(first.points.reshape(rows, columns, 3), first_path)
+        return (fitted, columns, rows), ("intrinsics are fitted to the points of the first cloud",)
+    known = find_intrinsics(path, overrides) if path.is_dir() else None
+    intrinsics = known.intrinsics if intrinsics is None and known is not None else intrinsics
+    pixels = _image_coordinates(first_path) if intrinsics is None else None
+    whole, said = True, tuple[str, ...]()
+    if pixels is not None:
+        intrinsics = _fitted(first.points, pixels, first_path)
+        said = ("intrinsics are fitted to the image coordinates (imX, imY) of the first cloud's points",)
+    if intrinsics is None:
+        intrinsics, whole = _on_a_grid(_slopes(first.points), first_path), False
+        said = ("intrinsics are recovered: the points lie on the rays of a grid of pixels",)
+    return _window(clouds, intrinsics, axes, whole=whole), said
 
 
 _LEAST_Z = 1e-9
-_BACKWARD = 100  # times as many points behind the camera as before it
+_BEFORE = 100  # times as many points before the camera as behind it
 _LEAST_MM = 50.0  # median depth: nothing is 50 m away, nor 50 mm
 
 
@@ -181,9 +221,8 @@ class _Cloud:
     """Columns and rows; one row if it is not organised."""
 
 
-def _slopes(cloud: _Cloud, *, backward: bool) -> Array:
-    """Return x/z and y/z (n, 2) of the points before the camera."""
-    points = cloud.points * (_TURNED if backward else 1.0)
+def _slopes(points: npt.NDArray[np.float64]) -> Array:
+    """Return x/z and y/z (n, 2) of the points (n, 3) before the camera."""
     points = points[points[:, 2] > _LEAST_Z]
     slopes = points[:, :2] / points[:, 2:]
     return slopes[(np.abs(slopes) < _STEEPEST).all(axis=1)]
@@ -242,14 +281,14 @@ def _steps(slopes: Array) -> tuple[float, float]:
 
 
 def _window(
-    clouds: Mapping[int, Path], intrinsics: Intrinsics, *, backward: bool, whole: bool
+    clouds: Mapping[int, Path], intrinsics: Intrinsics, axes: Axes, *, whole: bool
 ) -> tuple[Intrinsics, int, int]:
     """Return intrinsics, width and height of an image that holds the points of all clouds.
 
     Args:
         clouds: by frame number.
         intrinsics: of the camera.
-        backward: whether y points up and z backward.
+        axes: of the files.
         whole: whether the principal point is given, so that pixels count from the image's corner.
 
     Raises:
@@ -258,7 +297,7 @@ def _window(
     fx, fy, cx, cy = intrinsics
     lows, highs = [], []
     for path in clouds.values():
-        slopes = _slopes(_read(path), backward=backward)
+        slopes = _slopes(_read(path).points @ _CAMERA_FROM[axes].T)
         if len(slopes):
             pixels = np.rint(slopes * (fx, fy) + (cx, cy))
             lows.append(pixels.min(axis=0))

@@ -16,7 +16,7 @@ from modeler.cli.build import Build
 from modeler.cli.console import _options
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.types import AbstractPrior, Outcome
-from modeler.verdict.advice import remedies, unchecked_focal_length
+from modeler.verdict.advice import estimated_focal_length, remedies, unchecked_focal_length
 
 
 def untrusted(
@@ -135,6 +135,15 @@ def test_a_loop_that_is_open_leads_to_the_focal_length() -> None:
     (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith("modeler calibrate-camera")
     assert found.parameters == {"camera": "camera.json"}
+
+
+@pytest.mark.parametrize(("sds", "said"), [(2.9, False), (3.3, True)])
+def test_a_focal_length_that_contradicts_the_given_one_is_named_with_its_causes(sds: float, *, said: bool) -> None:
+    camera = {"fx_px": 268.7, "factor_in_run": 268.7 / 287.5, "focal_factor_sigma": 0.004, "loops": 9}
+    camera |= {"sigmas_after": 1.1, "sigmas_before": 6.0, "given_sds": sds}
+    words = estimated_focal_length(camera)
+    assert words.startswith("the focal length is 268.7 ± 1.1 px, 287.5 px was given")
+    assert ("contradicts the given one by 3.3" in words, "along the ray" in words) == (said, said)
 
 
 def test_the_command_to_try_keeps_what_was_given() -> None:

@@ -77,19 +77,27 @@ def seen_points(frame: Frame, rng: np.random.Generator) -> np.ndarray:
     return rng.permutation(np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1))
 
 
-@pytest.mark.parametrize("viewer", [False, True])
+AXES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "camera": ("", lambda points: points),
+    "viewer": ("y points up and z backward", lambda points: points * (1.0, -1.0, -1.0)),
+    "body": ("x points forward and z up", lambda points: points[..., [2, 0, 1]] * (1.0, -1.0, -1.0)),
+}
+
+
+@pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
 def test_the_camera_of_points_on_its_pixels_is_recovered(
-    tmp_path: Path, frames: list[Frame], rng: np.random.Generator, *, viewer: bool, unit: float
+    tmp_path: Path, frames: list[Frame], rng: np.random.Generator, *, axes: str, unit: float
 ) -> None:
-    turned = (1.0, -1.0, -1.0) if viewer else (1.0, 1.0, 1.0)
+    said, turned = AXES[axes]
     clouds = [seen_points(frame, rng) for frame in frames]
     for index, points in enumerate(clouds):
-        write_points(tmp_path / f"view-{index + 1}.ply", points * turned * unit, 6 if unit == 1.0 else 4)
+        write_points(tmp_path / f"view-{index + 1}.ply", turned(points) * unit, 6 if unit == 1.0 else 4)
     sequence = open_sequence(tmp_path)
     assert sequence.indices == (1, 2, 3)
     assert sequence.layout == "clouds (PLY)"
-    assert any("y points up and z backward" in note for note in sequence.notes) == viewer
+    notes = " ".join(sequence.notes)
+    assert [each for each, _ in AXES.values() if each and each in notes] == [said] * bool(said)
     for read, points in zip(sequence, clouds, strict=True):
         camera = read.camera
         assert (camera.fx, camera.fy) == pytest.approx(OFF_CENTRE[:2], abs=0.01)

@@ -397,7 +397,13 @@ def test_an_object_cut_off_by_the_image_is_named(rng):
     ]
     segmenter = Segmenter()
     scene = segmenter.scene(frames)
-    assert all(segmenter.segment(frame, scene).outcome is Outcome.CUT_OFF for frame in frames)
+    found = [segmenter.segment(frame, scene) for frame in frames]
+    assert {each.outcome for each in found} == {Outcome.CUT_OFF}
+    given = [replace(frame, mask=each.mask) for frame, each in zip(frames, found, strict=True)]
+    scene = segmenter.scene(given)
+    assert {segmenter.segment(frame, scene).outcome for frame in given} == {Outcome.CUT_OFF}
+    inside = [replace(frame, mask=frame.mask & (np.arange(frame.depth_m.shape[1]) < 230)) for frame in given]
+    assert {segmenter.segment(frame, scene).outcome for frame in inside} == {Outcome.CONVERGED}
 
 
 def test_an_object_that_grows_is_unsure_and_one_that_is_gone_has_too_few_points(rng):

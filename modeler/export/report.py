@@ -164,6 +164,7 @@ def _camera(
         "depth_scale": before["depth_scale"],
         "depth_scale_sigma": total_depth_scale_sigma(float(before["depth_scale_sigma"]), focal),
         "told_by": focal.told_by,
+        "given_sds": abs(focal.log_factor) / focal.prior_sigma,
         "factor_in_run": in_run,  # beyond the file of a camera
         "fx_px": None if root is None else root.frame.camera.fx,
         "loops": focal.loops,

@@ -384,13 +384,13 @@ def _not_a_crease(height_m: Float32Array, fore: BoolArray, highest_m: float, rea
     return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)  # a crease surrounds the object
 
 
-def is_cut(mask: BoolArray, scene: Scene) -> bool:
-    """Return whether a mask (h, w) extends beyond the field of view."""
-    if scene.edge is None:
+def is_cut(mask: BoolArray, edge: BoolArray | None) -> bool:
+    """Return whether a mask (h, w) extends beyond the field of view with such an edge, which may be downsampled."""
+    if edge is None:
         return False
-    stride = round(len(mask) / len(scene.edge))
+    stride = round(len(mask) / len(edge))
     thin = mask[::stride, ::stride]
-    return bool(np.count_nonzero(thin & scene.edge) >= _CUT_SHARE * np.sqrt(np.count_nonzero(thin)))
+    return bool(np.count_nonzero(thin & edge) >= _CUT_SHARE * np.sqrt(np.count_nonzero(thin)))
 
 
 def nearest_seen_m(frames: Sequence[Frame], masks: Sequence[BoolArray]) -> Float32Array:

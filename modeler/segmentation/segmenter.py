@@ -14,6 +14,7 @@ from modeler.segmentation.depth_images import (
     DepthNoise,
     at_rim,
     change_at_rim,
+    edge_of,
     noise_within,
     planning_stride,
     point_image,
@@ -111,7 +112,8 @@ class Segmenter:
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
-        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support.
+        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support,
+        CUT_OFF if it goes on beyond the image.
         For sparse measurements, the mask includes the gaps between those of the object. An object
         of which its own mask leaves the rim out is modelled as far as it is seen.
         """
@@ -121,7 +123,9 @@ class Segmenter:
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
             loose = plane is not None and self._share_on(plane, frame, mask, scene.range_noise) > _LOOSE_SHARE
-            outcome = Outcome.UNSURE_MASK if loose else Outcome.CONVERGED
+            stride = planning_stride(frame.camera)
+            cut = is_cut(mask, edge_of(np.isfinite(_measured(frame)[::stride, ::stride])))
+            outcome = Outcome.UNSURE_MASK if loose else Outcome.CUT_OFF if cut else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
@@ -139,7 +143,7 @@ class Segmenter:
         sure = scene.sure and (scene.still or scene.plane is not None) and found.rival < RIVAL and not found.goes_on
         if scene.areas_m2 is not None:
             sure &= scene.areas_m2[0] / AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * AREA_FACTOR
-        whole = Outcome.CUT_OFF if is_cut(mask, scene) else Outcome.CONVERGED
+        whole = Outcome.CUT_OFF if is_cut(mask, scene.edge) else Outcome.CONVERGED
         return Segmentation(mask, scene.plane, whole if sure else Outcome.UNSURE_MASK)
 
     def _looks(self, frames: Sequence[Frame], scene: Scene) -> tuple[list[_Look], list[_Look]]:
@@ -149,7 +153,7 @@ class Segmenter:
         """
         looks = [(frame, self._find(frame, scene)) for frame in frames]
         looks = [(frame, look) for frame, look in looks if np.count_nonzero(look.mask) >= self.min_points]
-        whole = [(frame, look) for frame, look in looks if not (look.goes_on or is_cut(look.mask, scene))]
+        whole = [(frame, look) for frame, look in looks if not (look.goes_on or is_cut(look.mask, scene.edge))]
         return looks, whole if 2 * len(whole) >= len(looks) else []
 
     def _learn(self, frames: Sequence[Frame]) -> Scene:

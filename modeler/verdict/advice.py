@@ -18,6 +18,7 @@ _FAR_SDS: Final = 3.0  # of the given step, beyond which the measured one contra
 _ROUGH: Final = (
     0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
 )
+_CHANCE_SDS: Final = 3.0  # of the given focal length; chance in 3 of 1000 runs
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method/search.md)
 _FAR_DEG: Final = 100.0  # 1 % of this rotation is 1°, a third of a wrong pose
 _BY_OPTIONS: Final = {
@@ -150,7 +151,23 @@ def estimated_focal_length(camera: Mapping[str, Any]) -> str:
     if fx_px is None or not camera.get("loops"):
         return ""
     sds = camera["sigmas_after"], camera["sigmas_before"]
-    return focal_length_found((fx_px, sigma * fx_px), fx_px / factor, camera["loops"], sds, "as given")
+    found = focal_length_found((fx_px, sigma * fx_px), fx_px / factor, camera["loops"], sds, "as given")
+    return "; ".join(filter(None, (found, contradicted_focal_length(camera))))
+
+
+def contradicted_focal_length(camera: Mapping[str, Any]) -> str:
+    """Return in words that the estimated focal length contradicts the given one, with likely causes, else "".
+
+    Args:
+        camera: as in report.json.
+    """
+    if (sds := camera.get("given_sds", 0.0)) <= _CHANCE_SDS:
+        return ""
+    return (
+        f"it contradicts the given one by {sds:.1f} of its standard deviations, which distances along the ray, "
+        "a lens that is not taken out, intrinsics of another camera or image size, or depth that is "
+        "wrong by a share of its relief would explain"
+    )
 
 
 def focal_length_found(

@@ -20,6 +20,7 @@ from modeler.export.mesh import MOST_SIGMA_M
 from modeler.export.placing import model_up, model_upright
 from modeler.fusion import Symmetries, SymmetryFinder
 from modeler.types import ACCEPTED, Array, InputError, Outcome, loops_closed
+from modeler.verdict.advice import contradicted_focal_length
 from modeler.viz.report import plots
 from modeler.viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
 from modeler.viz.report.mesh import Mesh, portrait, read_mesh, scene
@@ -84,6 +85,7 @@ def _focal_length(camera: Mapping[str, Any] | None) -> list[tuple[str, str, str]
         f"{fx_px / camera['factor_in_run']:.1f} px was given; loop closure error {camera['sigmas_after']:.1f} sd with "
         f"this one, {camera['sigmas_before']:.1f} sd as given; poses and surface are those under this one"
     )
+    why = "; ".join(filter(None, (why, contradicted_focal_length(camera))))
     return [(value, "focal length, estimated from loops", why)]
 
 
