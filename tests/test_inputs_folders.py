@@ -2,57 +2,25 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import pytest
 from PIL import Image
 from scipy import ndimage
 
 from modeler.segmentation import Segmenter
 from modeler.sequences import Overrides, open_sequence, survey
-from modeler.types import Camera, Frame, InputError
+from modeler.types import Frame, InputError
 from studies.formats.image_folders import raw_depth, save
+from studies.formats.other_programs import CAMERAS, DEPTHS, LENS, NAMES, distorted, exr, write_camera
 
 
-def write_camera(folder: Path, camera: Camera, **more: object) -> None:
-    facts = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    (folder / "camera.json").write_text(json.dumps(facts | more))
-
-
-def exr(path: Path, depth_m: np.ndarray, channel: str = "Z") -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {channel: depth_m}) as file:
-        file.write(str(path))
-
-
-def pgm(path: Path, units: np.ndarray) -> None:
-    head = f"P5\n# a comment\n{units.shape[1]} {units.shape[0]}\n4000\n".encode()
-    path.write_bytes(head + units.astype(">u2").tobytes())
-
-
-def write_npz(path: Path, depth_m: np.ndarray) -> None:
-    np.savez_compressed(path, depth=depth_m)
-
-
-WRITERS: dict[str, tuple[Callable[[Path, np.ndarray], object], float]] = {
-    "exr": (exr, 1.0),
-    "npy": (np.save, 1.0),
-    "npz": (write_npz, 1.0),
-    "tiff": (save, 1.0),
-    "npy in mm": (np.save, 1000.0),
-    "pgm": (lambda path, units: pgm(path, np.rint(units)), 1000.0),
-}
-
-
-@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("kind", DEPTHS)
 def test_depth_is_read_in_each_format(tmp_path: Path, frames: list[Frame], kind: str) -> None:
-    write, units = WRITERS[kind]
+    write, units = DEPTHS[kind]
     (tmp_path / "depth").mkdir()
     for frame in frames:
         stored = (np.nan_to_num(frame.depth_m) * np.float32(units)).astype(np.float32)
@@ -107,17 +75,6 @@ def test_arrays_that_claim_to_be_enormous_are_refused(tmp_path: Path, frames: li
         open_sequence(tmp_path)
 
 
-NAMES: dict[str, tuple[str, str | None, str | None]] = {
-    "suffixes": ("{0}_depth.png", "{0}.jpg", "{0}_mask.jpg"),
-    "7-Scenes": ("frame-{0:06d}.depth.png", "frame-{0:06d}.color.png", None),
-    "Washington": ("cup_1_1_{0}_depth.png", "cup_1_1_{0}.png", None),
-    "ticks": ("DepthImage_{1}_{0}.png", None, None),
-    "in front": ("frame_{0}_depth.png", "frame_{0}_rgb.bmp", "frame_{0}_mask.png"),
-    "aligned": ("aligned_depth_to_color/{0}.png", "color/{0}.png", "masks/{0}.jpg"),
-    "bitmaps": ("depth/{0}.png", "rgb/{0}.bmp", "mask/{0}.bmp"),
-}
-
-
 @pytest.mark.parametrize("kind", NAMES)
 def test_names_state_what_images_are(tmp_path: Path, frames: list[Frame], kind: str) -> None:
     depth, colour, mask = NAMES[kind]
@@ -143,68 +100,6 @@ def test_names_state_what_images_are(tmp_path: Path, frames: list[Frame], kind: 
         np.testing.assert_allclose(np.diff([frame.time_s for frame in sequence]), 0.5, atol=1e-4)
 
 
-LENS = (-0.28, 0.09, 0.001, -0.002, 0.01)
-
-
-def opencv(camera: Camera) -> str:
-    data = f"[{camera.fx}, 0., {camera.cx}, 0., {camera.fy}, {camera.cy}, 0., 0., 1.]"
-    return (
-        "%YAML:1.0\n---\nimage_width: 160\nimage_height: 120\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
-        f"   dt: d\n   data: {data}\ndistortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
-        f"   data: {list(LENS)}\n"
-    )
-
-
-def ros(camera: Camera) -> str:
-    data = f"[{camera.fx}, 0, {camera.cx}, 0, {camera.fy}, {camera.cy}, 0, 0, 1]"
-    return f"width: 160\nheight: 120\ndistortion_model: plumb_bob\nD: {list(LENS)}\nK: {data}\n"
-
-
-def orb_slam(camera: Camera) -> str:
-    names = (*zip(("fx", "fy", "cx", "cy"), (camera.fx, camera.fy, camera.cx, camera.cy), strict=True),
-             *zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True))  # fmt: skip
-    return "%YAML:1.0\n" + "".join(f"Camera.{name}: {value}\n" for name, value in names) + "DepthMapFactor: 1000.0\n"
-
-
-def kalibr(camera: Camera) -> str:
-    pixels = [camera.fx, camera.fy, camera.cx, camera.cy]
-    return (
-        f"cam0:\n  camera_model: pinhole\n  intrinsics: {pixels}\n  distortion_model: radtan\n"
-        f"  distortion_coeffs: {list(LENS)}\n  resolution: [160, 120]\n"
-    )
-
-
-def as_json(**more: object) -> Callable[[Camera], str]:
-    facts = lambda camera: {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}  # noqa: E731
-    return lambda camera: json.dumps(facts(camera) | more)
-
-
-CAMERAS: dict[str, tuple[str, Callable[[Camera], str]]] = {
-    "RealSense": ("camera.json", as_json(model="brown_conrady", coeffs=list(LENS))),
-    "by name": ("camera.json", as_json(k1=LENS[0], k2=LENS[1], p1=LENS[2], p2=LENS[3], k3=LENS[4])),
-    "OpenCV": ("calib.yml", opencv),
-    "ROS": ("camera_info.yaml", ros),
-    "ORB-SLAM": ("TUM1.yaml", orb_slam),
-    "Kalibr": ("camchain.yaml", kalibr),
-    "line": ("calibration.txt", lambda c: f"{c.fx} {c.fy} {c.cx} {c.cy} {' '.join(map(str, LENS))}"),
-}
-
-
-def distorted(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return an image as a lens shows it: each of its pixels looks up the ray that reaches it, found by iteration."""
-    k1, k2, p1, p2, k3 = LENS
-    rays = [np.array(each) for each in camera.rays()]
-    w, h = rays
-    for _ in range(40):
-        s = w**2 + h**2
-        radial = 1.0 + s * (k1 + s * (k2 + s * k3))
-        w, h = (
-            (rays[0] - 2.0 * p1 * w * h - p2 * (s + 2.0 * w**2)) / radial,
-            (rays[1] - p1 * (s + 2.0 * h**2) - 2.0 * p2 * w * h) / radial,
-        )
-    return ndimage.map_coordinates(image, [h * camera.fy + camera.cy, w * camera.fx + camera.cx], order=0)
-
-
 @pytest.mark.parametrize("kind", CAMERAS)
 def test_lenses_beside_the_intrinsics_are_taken_out(tmp_path: Path, frames: list[Frame], kind: str) -> None:
     name, text = CAMERAS[kind]
@@ -215,7 +110,7 @@ def test_lenses_beside_the_intrinsics_are_taken_out(tmp_path: Path, frames: list
     save(tmp_path / "masks" / "0.png", distorted(frame.mask.astype(np.uint8) * 255, camera))
     colour = [distorted(frame.colour[..., channel], camera) for channel in range(3)]
     save(tmp_path / "rgb" / "0.png", np.stack(colour, axis=2))
-    (tmp_path / name).write_text(text(camera))
+    (tmp_path / name).write_text(text(camera, LENS))
     sequence = open_sequence(tmp_path)
     read = sequence.frame(0)
     assert any("-0.28 0.09" in note and "taken out" in note for note in sequence.notes)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from modeler.sequences import BopSequence, WatchLimits, open_sequence, watch, write_bop
-from modeler.sequences.watch import _state
+from modeler.sequences import AbstractSequence, BopSequence, Overrides, WatchLimits, open_sequence, watch, write_bop
+from modeler.sequences.watch import _state, arriving
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import small_frames, write_bundlesdf, write_tum
 
@@ -76,6 +78,22 @@ def test_frames_are_taken_whole_as_they_come(
         np.testing.assert_allclose(read.depth_m, wrote.depth_m, atol=1e-6)
         np.testing.assert_array_equal(read.mask, wrote.mask)  # type: ignore[arg-type]
         np.testing.assert_array_equal(read.colour, wrote.colour)  # type: ignore[arg-type]
+
+
+def test_a_folder_is_opened_anew_only_once_it_has_changed(
+    tmp_path: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Path] = []
+
+    def counted(path: Path, *more: Any) -> AbstractSequence:
+        opened.append(path)
+        return open_sequence(path, *more)
+
+    monkeypatch.setattr(sys.modules["modeler.sequences.watch"], "open_sequence", counted)
+    write_bop(tmp_path / "s", frames, depth_scale_mm=1.0)
+    arrived = arriving(tmp_path / "s", Overrides(), QUICK, lambda: False)
+    assert [frame.index for frame in arrived] == [0, 1, 2, 3, 4]
+    assert len(opened) == 1
 
 
 def test_a_list_that_grows_is_followed(

@@ -292,7 +292,7 @@ def _run(
                 stream, lambda event: frames.live and not (isinstance(event, Step) and event.last), share=DRAWING_SHARE
             ) as draw,
             Interrupt() as interrupt,
-            Console(len(frames), stream.address, modeler.prior) as console,
+            Console(None if frames.live else len(frames), stream.address, modeler.prior) as console,
             advising(run.modeler, console.advise, stream.advise) as advise,
         ):
             followed = frames.live and (console.watched or stream.shown is not None)

@@ -225,7 +225,7 @@ def _rounded(seconds: float) -> str:
 class Console:
     """A sink of steps for a terminal; if stderr is none, only frames left out are reported."""
 
-    def __init__(self, frames: int, address: str | None, prior: AbstractPrior | None = None) -> None:
+    def __init__(self, frames: int | None, address: str | None, prior: AbstractPrior | None = None) -> None:
         self._bar = bar()
         self._task = self._bar.add_task("", total=frames)
         self._frames, self._stage = frames, ""
@@ -320,12 +320,12 @@ class Console:
         now_s, done = time.monotonic(), len(self._placed)
         if self._began_s is None:
             self._began_s = now_s
-        elif done == _PAIRS_TIMED + 1 < self._frames:
+        elif self._frames is not None and done == _PAIRS_TIMED + 1 < self._frames:
             whole_s = _WHOLE * (now_s - self._began_s) / _PAIRS_TIMED * self._frames
             if whole_s > _WORTH_SAYING_S:
                 self._say(f"{self._frames} frames: to register, close loops and fuse takes about {_rounded(whole_s)}")
         elif not self.watched and now_s - self._said_s > _PULSE_S:
-            self._say(f"frame {done} of {self._frames}")
+            self._say(f"frame {done}" if self._frames is None else f"frame {done} of {self._frames}")
 
     def _show_stage(self, stage: str, done: int, total: int) -> None:
         """Show the progress after the last frame."""

@@ -2,9 +2,11 @@
 
 `python -m studies loops.memory --frames 5000 --out runs/memory` renders an object that turns by 3° a frame, a
 folder of images that is reused, and builds it as the command does: with stored pairs, recording and report. With
---told-truth, ground truth replaces registration, to measure the cost of everything else. Ctrl-C ends it with the frames
-so far. stdout has a line for every --every steps: resident memory as the system counts it (what the program
-allocated, and what it read of mapped files), and the most so far.
+--told-truth, ground truth replaces registration, to measure the cost of everything else. With --watch, the folder is
+written while it is built, as fast as frames are taken, and with faults: files in two halves, cut off for good, or late,
+links to nothing, intrinsics that are gone for a moment. Ctrl-C ends it with the frames so far. stdout has a line for
+every --every steps: resident memory as the system counts it (what the program allocated, and what it read of mapped
+files), and the most so far.
 """
 
 from __future__ import annotations
@@ -12,10 +14,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
+
+import numpy as np
 
 from modeler.cli import build, main
 from modeler.cli.console import Console
@@ -58,17 +65,70 @@ def write_repeated(folder: Path, pictures: Path, count: int, frames: int) -> Non
     (folder / "sequence.json").write_text(json.dumps(described))
 
 
+def write_slowly(folder: Path, pictures: Path, count: int, frames: int, taken: Callable[[], int]) -> None:
+    """Write depth, masks and intrinsics into a folder that somebody watches, with faults, and the file that ends it.
+
+    Args:
+        folder: where.
+        pictures: sequence of `count` frames, whose files are written in turn.
+        count: its frames.
+        frames: to write.
+        taken: returns the number of the newest that has been taken: those far ahead of it wait.
+    """
+    rng = np.random.default_rng(0)
+    camera = json.loads((pictures / "scene_camera.json").read_text())["0"]
+    fx, _, cx, _, fy, cy, *_ = camera["cam_K"]
+    settings = folder / "camera.json"
+    settings.write_text(json.dumps({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": camera["depth_scale"]}))
+    for part in ("depth", "masks"):
+        (folder / part).mkdir()
+    order = np.arange(frames)
+    for place in rng.choice(max(frames - 2, 0), frames // FAULTY, replace=False):
+        order[[place, place + 1]] = order[[place + 1, place]]  # comes late
+    for written, number in enumerate(map(int, order)):
+        while written - taken() > _AHEAD:
+            time.sleep(0.02)
+        shown, name = number % count, f"{number:06d}.png"
+        os.link(pictures / "mask_visib" / f"{shown:06d}_000000.png", folder / "masks" / name)
+        content, path = (pictures / "depth" / f"{shown:06d}.png").read_bytes(), folder / "depth" / name
+        match int(rng.integers(5 * FAULTY)) if written else -1:
+            case 0:
+                path.write_bytes(content[: len(content) // 2])  # for good
+            case 1:
+                path.write_bytes(content[: len(content) // 2])
+                time.sleep(0.2)
+                path.write_bytes(content)
+            case 2:
+                (folder / "depth" / f".#{name}").symlink_to("nowhere")  # an editor's lock
+                path.write_bytes(content)
+            case 3:
+                settings.rename(folder / "gone")
+                time.sleep(0.2)
+                path.write_bytes(content)
+                (folder / "gone").rename(settings)
+            case _:
+                path.write_bytes(content)
+    (folder / "done").touch()
+
+
+FAULTY: Final = 20
+"""One of so many frames comes late, and as many have another fault."""
+_AHEAD: Final = 5
+
+
 class Meter(Console):
     """The terminal's sink of steps, which also notes time and memory."""
 
     every: ClassVar = 250
     costs: ClassVar[list[dict[str, Any]]] = []
+    newest: ClassVar = 0
 
     def __call__(self, event: Any) -> None:
         """Note a step."""
         super().__call__(event)
         if not isinstance(event, Step):
             return
+        Meter.newest = max(self.newest, event.frame.index)
         now = {"s": time.monotonic(), "cpu_s": time.process_time(), "views": len(event.views)}
         self.costs.append({**now, "edges": len(event.edges_so_far), "last": event.last, **memory_mib()})
         if event.last or len(self.costs) % self.every == 0:
@@ -98,6 +158,7 @@ def run() -> int:
     parser.add_argument("--shape", default="figurine", help="recipe of the rendered object")
     parser.add_argument("--width", type=int, default=320, help="of the images in pixels, whose height is 3/4 of it")
     parser.add_argument("--out", type=Path, default=Path("runs/memory"), help="folder of the sequence and the run")
+    parser.add_argument("--watch", action="store_true", help="write the folder while it is built, with faults")
     parser.add_argument("--told-truth", action="store_true", help="register by the truth")
     parser.add_argument("options", nargs="*", default=["--prior", "table"], help="of modeler build, after --")
     options = parser.parse_args()
@@ -106,17 +167,25 @@ def run() -> int:
     pictures = options.out / f"{options.shape}-{options.width}-{count}"
     if not pictures.exists():
         write_sequence(pictures, count, shape=options.shape, width=options.width)
-    if not sequence.exists():
+    if options.watch:
+        sequence = options.out / f"{options.shape}-{options.width}-watched"
+        shutil.rmtree(sequence, ignore_errors=True)
+        sequence.mkdir()
+        arguments = (sequence, pictures, count, options.frames, lambda: Meter.newest)
+        threading.Thread(target=write_slowly, args=arguments, daemon=True).start()
+    elif not sequence.exists():
         write_repeated(sequence, pictures, count, options.frames)
     Meter.every = options.every
     build.Console = Meter
     if options.told_truth:
-        truth = open_sequence(sequence).truth() or {}
+        known = open_sequence(pictures).truth() or {}
+        truth = {frame: known[frame % count] for frame in range(options.frames)}
         compose.registrar = lambda *_, **__: Known(truth)
+    watched = ["--watch", "--idle-s", "60"] if options.watch else []
     print("  step  " + "  ".join(f"{name:>7}" for name in _FIELDS) + "             edges      wall   processor")
-    kind = "-told" if options.told_truth else ""
+    kind = "-told" * options.told_truth + "-watched" * options.watch
     run_folder = options.out / f"run-{options.width}-{options.frames}{kind}"
-    status = main(["build", str(sequence), "--out", str(run_folder), "--overwrite", *options.options])
+    status = main(["build", str(sequence), "--out", str(run_folder), "--overwrite", *watched, *options.options])
     (options.out / f"costs-{options.width}-{options.frames}{kind}.json").write_text(json.dumps(Meter.costs) + "\n")
     print(f"status {status}; at the end of the program: {memory_mib()['VmHWM']:.0f} MiB at most")
     return 0 if status in (0, 3) else status
