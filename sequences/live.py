@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import itertools
 import weakref
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, final
@@ -32,31 +31,42 @@ Image = tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]
 """Time in s, raw depth (h, w), and colour (h, w, 3) of the depth camera's pixels, if there is any."""
 
 
-class AbstractCamera(ABC):
-    """A camera that is running."""
+@final
+@dataclass(frozen=True, eq=False)
+class RunningCamera:
+    """A camera that a library runs."""
 
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """Name of the camera."""
+    name: str
+    """Model of the camera."""
+    lens: Lens
+    """The camera whose pixels depth and colour are on."""
+    unit_mm: float
+    """Millimetres per unit of depth."""
+    newest: Callable[[], Image | None]
+    """Waits for an image; None if none comes."""
+    stop: Callable[[], object]
+    """Ends it."""
+    failures: tuple[type[Exception], ...]
+    """What the library raises."""
 
-    @property
-    @abstractmethod
-    def lens(self) -> Lens:
-        """The depth camera."""
-
-    @property
-    @abstractmethod
-    def unit_mm(self) -> float:
-        """Millimetres per unit of depth."""
-
-    @abstractmethod
     def take(self) -> Image:
-        """Return the newest image.
+        """Return the newest image; older ones are dropped.
 
         Raises:
             InputError: if the camera gives none.
         """
+        try:
+            image = self.newest()
+        except self.failures as error:
+            raise InputError(f"{self.name}: gives no image ({in_a_line(error)}); reconnect it.") from None
+        if image is None:
+            raise InputError(f"{self.name}: gives no image for {TIMEOUT_MS / 1000:g} s; reconnect it.")
+        return image
+
+
+def in_a_line(error: Exception) -> str:
+    """Return what a library says."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 @final
@@ -64,7 +74,7 @@ class AbstractCamera(ABC):
 class LiveSequence(AbstractSequence):
     """Images of a running camera, taken on demand until `stop()` is true."""
 
-    camera: AbstractCamera
+    camera: RunningCamera
     """The running camera."""
     seen: tuple[Frame, ...]
     """Its first frame."""
@@ -148,7 +158,7 @@ class LiveSequence(AbstractSequence):
             yield last
 
 
-def begin(camera: AbstractCamera, first: int | None = None) -> LiveSequence:
+def begin(camera: RunningCamera, first: int | None = None) -> LiveSequence:
     """Return the images of a camera from now on."""
     seen: list[Frame] = []
     for number in range(FIRST if first is None else first):
@@ -156,7 +166,7 @@ def begin(camera: AbstractCamera, first: int | None = None) -> LiveSequence:
     return LiveSequence(camera, tuple(seen))
 
 
-def _next(camera: AbstractCamera, number: int, after_s: float | None) -> Frame:
+def _next(camera: RunningCamera, number: int, after_s: float | None) -> Frame:
     """Return the first image that is not the one of `after_s` again, as it may come with another colour image."""
     for _ in range(MAX_REPEATS):
         time_s, raw, colour = camera.take()
@@ -194,8 +204,25 @@ def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveS
         library = importlib.import_module("pyrealsense2")
     except ImportError:
         raise InputError(f"{SCHEME}{serial}: {ADVICE}.") from None
-    camera = RealsenseCamera.start(library, serial, overrides, context)
-    for _ in range(WARM_UP if context is None else 0):
+    camera = _started(library, serial, context)
+    return opened(camera, overrides, WARM_UP if context is None else 0)
+
+
+def opened(camera: RunningCamera, overrides: Overrides, warm_up: int = WARM_UP) -> LiveSequence:
+    """Return the images of a camera that was started, which is stopped once it is forgotten.
+
+    Args:
+        camera: as its library describes it.
+        overrides: values that take precedence.
+        warm_up: number of images to drop.
+    """
+    if overrides.intrinsics is not None:
+        size = camera.lens.camera.width, camera.lens.camera.height
+        camera = replace(camera, lens=Lens(Camera(*size, *overrides.intrinsics), ()))
+    if overrides.depth_scale_mm is not None:
+        camera = replace(camera, unit_mm=overrides.depth_scale_mm)
+    weakref.finalize(camera, camera.stop)
+    for _ in range(warm_up):
         camera.take()
     return replace(begin(camera), by_maker=overrides.intrinsics is None)
 
@@ -211,85 +238,43 @@ def _check_present(rs: Any, context: Any, serial: str) -> None:
         raise InputError(f"{SCHEME}{serial}: no such camera is plugged in; there is {', '.join(present) or 'another'}.")
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class RealsenseCamera(AbstractCamera):
-    """A camera that streams depth and colour."""
+def _started(rs: Any, serial: str, context: Any) -> RunningCamera:
+    """Start the RealSense camera with a serial number, or the only one.
 
-    pipeline: Any
-    """Gives the images."""
-    align: Any
-    """Brings colour to the depth camera's pixels."""
-    model: str
-    """Model of the camera."""
-    depth: Lens
-    """The depth camera."""
-    scale_mm: float
-    """Millimetres per unit."""
+    Args:
+        rs: the library.
+        serial: may be empty.
+        context: where to look for cameras; None for everywhere.
 
-    @classmethod
-    def start(cls, rs: Any, serial: str, overrides: Overrides, context: Any) -> RealsenseCamera:
-        """Start the camera with a serial number, or the only one.
+    Raises:
+        InputError: if it cannot be started.
+    """
+    try:
+        context = rs.context() if context is None else context
+        _check_present(rs, context, serial)
+        pipeline, config = rs.pipeline(context), rs.config()
+        if serial:
+            config.enable_device(serial)
+        config.enable_stream(rs.stream.depth)
+        # With two arguments, the library would take the format for the number of a stream.
+        config.enable_stream(rs.stream.color, rs.format.rgb8, 0)
+        if not config.can_resolve(rs.pipeline_wrapper(pipeline)):
+            config.disable_stream(rs.stream.color)  # some cameras have none
+        profile = pipeline.start(config)
+        device, align = profile.get_device(), rs.align(rs.stream.depth)  # brings colour to the depth camera's pixels
+        found = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+        unit_mm = 1000.0 * device.first_depth_sensor().get_depth_scale()
+        model = device.get_info(rs.camera_info.name) if device.supports(rs.camera_info.name) else "RealSense"
+    except RuntimeError as error:
+        raise InputError(f"{SCHEME}{serial}: cannot be started ({in_a_line(error)}); reconnect it.") from None
 
-        Args:
-            rs: the library.
-            serial: may be empty.
-            overrides: values that take precedence over the camera's.
-            context: where to look for cameras; None for everywhere.
+    def newest() -> Image:
+        frames = align.process(pipeline.wait_for_frames(TIMEOUT_MS))
+        depth, colour = frames.get_depth_frame(), frames.get_color_frame()
+        raw = np.asanyarray(depth.get_data()).astype(np.uint16)
+        image = np.array(colour.get_data(), dtype=np.uint8) if colour else None
+        return float(depth.get_timestamp()) / 1000.0, raw, image
 
-        Raises:
-            InputError: if it cannot be started.
-        """
-        where = f"{SCHEME}{serial}"
-        try:
-            context = rs.context() if context is None else context
-            _check_present(rs, context, serial)
-            pipeline, config = rs.pipeline(context), rs.config()
-            if serial:
-                config.enable_device(serial)
-            config.enable_stream(rs.stream.depth)
-            # With two arguments, the library would take the format for the number of a stream.
-            config.enable_stream(rs.stream.color, rs.format.rgb8, 0)
-            if not config.can_resolve(rs.pipeline_wrapper(pipeline)):
-                config.disable_stream(rs.stream.color)  # some cameras have none
-            profile = pipeline.start(config)
-            device = profile.get_device()
-            stream = profile.get_stream(rs.stream.depth).as_video_stream_profile()
-            intrinsics = stream.get_intrinsics()
-            unit_mm = 1000.0 * device.first_depth_sensor().get_depth_scale()
-            model = device.get_info(rs.camera_info.name) if device.supports(rs.camera_info.name) else "RealSense"
-        except RuntimeError as error:
-            raise InputError(f"{where}: cannot be started ({' '.join(str(error).split())}); reconnect it.") from None
-        found = (intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy)
-        camera = Camera(intrinsics.width, intrinsics.height, *(overrides.intrinsics or found))
-        distortion = () if overrides.intrinsics else coefficients(intrinsics.coeffs)
-        scale_mm = unit_mm if overrides.depth_scale_mm is None else overrides.depth_scale_mm
-        running = cls(pipeline, rs.align(rs.stream.depth), model, Lens(camera, distortion), scale_mm)
-        weakref.finalize(running, pipeline.stop)
-        return running
-
-    @property
-    def name(self) -> str:
-        """Name of the camera."""
-        return self.model
-
-    @property
-    def lens(self) -> Lens:
-        """The depth camera."""
-        return self.depth
-
-    @property
-    def unit_mm(self) -> float:
-        """Millimetres per unit of depth."""
-        return self.scale_mm
-
-    def take(self) -> Image:
-        """Return the newest image; older ones are dropped."""
-        try:
-            frames = self.align.process(self.pipeline.wait_for_frames(TIMEOUT_MS))
-            depth, colour = frames.get_depth_frame(), frames.get_color_frame()
-            raw = np.asanyarray(depth.get_data()).astype(np.uint16)
-            image = np.array(colour.get_data(), dtype=np.uint8) if colour else None
-            return float(depth.get_timestamp()) / 1000.0, raw, image
-        except RuntimeError as error:
-            raise InputError(f"{self.model}: gives no image ({' '.join(str(error).split())}); reconnect it.") from None
+    camera = Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy)
+    lens = Lens(camera, coefficients(found.coeffs))
+    return RunningCamera(model, lens, unit_mm, newest, pipeline.stop, (RuntimeError,))

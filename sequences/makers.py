@@ -6,69 +6,19 @@ A function starts a camera and returns what takes its images; `live` does the re
 from __future__ import annotations
 
 import importlib
-import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from datetime import timedelta
-from typing import Any, Final, final
+from typing import Any, Final
 
 import numpy as np
 
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens
-from modeler.sequences.live import TIMEOUT_MS, WARM_UP, AbstractCamera, Image, LiveSequence, begin
+from modeler.sequences.live import TIMEOUT_MS, Image, LiveSequence, RunningCamera, in_a_line, opened
 from modeler.system.extras import install_command
 from modeler.types import Camera, InputError
 
 _OAK_PX: Final = (640, 400)  # width and height of depth and colour: stereo of all models gives as many
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class RunningCamera(AbstractCamera):
-    """A camera that some library runs."""
-
-    model: str
-    """Model of the camera."""
-    depth: Lens
-    """The camera whose pixels depth and colour are on."""
-    scale_mm: float
-    """Millimetres per unit."""
-    newest: Callable[[], Image | None]
-    """Waits for an image; None if none comes."""
-    stop: Callable[[], object]
-    """Ends it."""
-    failures: tuple[type[Exception], ...]
-    """What the library raises."""
-
-    @property
-    def name(self) -> str:
-        """Name of the camera."""
-        return self.model
-
-    @property
-    def lens(self) -> Lens:
-        """The depth camera."""
-        return self.depth
-
-    @property
-    def unit_mm(self) -> float:
-        """Millimetres per unit of depth."""
-        return self.scale_mm
-
-    def take(self) -> Image:
-        """Return the newest image."""
-        try:
-            image = self.newest()
-        except self.failures as error:
-            raise InputError(f"{self.model}: gives no image ({_line(error)}); reconnect it.") from None
-        if image is None:
-            raise InputError(f"{self.model}: gives no image for {TIMEOUT_MS / 1000:g} s; reconnect it.")
-        return image
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def orbbec(ob: Any, serial: str) -> RunningCamera:
@@ -121,7 +71,7 @@ def orbbec(ob: Any, serial: str) -> RunningCamera:
         model = f"Orbbec {device.get_device_info().get_name().removeprefix('Orbbec ')}"
         return RunningCamera(model, lens, float(first.get_depth_scale()), newest, pipeline.stop, failures)
     except failures as error:
-        raise InputError(f"{where}: cannot be started ({_line(error)}); reconnect it.") from None
+        raise InputError(f"{where}: cannot be started ({in_a_line(error)}); reconnect it.") from None
 
 
 def oak(dai: Any, serial: str) -> RunningCamera:
@@ -176,7 +126,7 @@ def oak(dai: Any, serial: str) -> RunningCamera:
         lens = Lens(Camera(width, height, fx, fy, cx, cy), ())
         return RunningCamera(str(device.getProductName()), lens, 1.0, newest, pipeline.stop, failures)
     except failures as error:
-        raise InputError(f"{where}: cannot be started ({_line(error)}); reconnect it.") from None
+        raise InputError(f"{where}: cannot be started ({in_a_line(error)}); reconnect it.") from None
 
 
 def azure(k4a: Any, serial: str) -> RunningCamera:
@@ -220,7 +170,7 @@ def azure(k4a: Any, serial: str) -> RunningCamera:
         lens = Lens(camera, tuple(map(float, device.calibration.get_distortion_coefficients(kind))))
         return RunningCamera(f"Azure Kinect {device.serial}", lens, 1.0, newest, device.stop, failures)
     except failures as error:
-        raise InputError(f"{where}: cannot be started ({_line(error)}); reconnect it.") from None
+        raise InputError(f"{where}: cannot be started ({in_a_line(error)}); reconnect it.") from None
 
 
 LIBRARIES: Final[Mapping[str, tuple[str, str, Callable[[Any, str], RunningCamera]]]] = {
@@ -249,13 +199,4 @@ def open_camera_of(maker: str, serial: str, overrides: Overrides) -> LiveSequenc
         raise InputError(
             f"{maker}:{serial}: a camera of this kind is read by its maker's library; {install_command(extra)}."
         ) from None
-    camera = start(library, serial)
-    if overrides.intrinsics is not None:
-        given = replace(camera.depth.camera, **dict(zip(("fx", "fy", "cx", "cy"), overrides.intrinsics, strict=True)))
-        camera = replace(camera, depth=Lens(given, ()))
-    if overrides.depth_scale_mm is not None:
-        camera = replace(camera, scale_mm=overrides.depth_scale_mm)
-    weakref.finalize(camera, camera.stop)
-    for _ in range(WARM_UP):
-        camera.take()
-    return replace(begin(camera), by_maker=overrides.intrinsics is None)
+    return opened(start(library, serial), overrides)

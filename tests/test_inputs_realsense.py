@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import re
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.sequences import CalibratedSequence, NoiseModel, Overrides, open_sequence, survey
 from modeler.sequences.lens import Lens, lens_of_model
-from modeler.sequences.live import AbstractCamera, begin, open_camera
+from modeler.sequences.live import Image, RunningCamera, begin, open_camera
 from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
 from studies.formats.image_folders import raw_depth, small_frames
@@ -146,31 +145,19 @@ def test_the_makers_library_sees_points_where_our_lens_does(rs: Any, model: str)
 # A camera that is running
 
 
-@dataclass(frozen=True)
-class StandIn(AbstractCamera):
+class StandIn:
     """A camera that sees one thing after the other."""
 
-    frames: list[Frame]
-    taken: list[int] = field(default_factory=list)
-    times_s: tuple[float, ...] = ()
-    lasts: int = 1000
+    def __init__(self, frames: list[Frame], times_s: tuple[float, ...] = (), lasts: int = 1000) -> None:
+        self.frames, self.times_s, self.lasts = frames, times_s, lasts
+        self.taken: list[int] = []
+        lens = Lens(frames[0].camera, ())
+        self.camera = RunningCamera("stand-in", lens, 1.0, self.newest, self.taken.clear, (RuntimeError,))
 
-    @property
-    def name(self) -> str:
-        return "stand-in"
-
-    @property
-    def lens(self) -> Lens:
-        return Lens(self.frames[0].camera, ())
-
-    @property
-    def unit_mm(self) -> float:
-        return 1.0
-
-    def take(self) -> tuple[float, np.ndarray, np.ndarray | None]:
+    def newest(self) -> Image | None:
         number = len(self.taken)
         if number == self.lasts:
-            raise InputError("stand-in: gives no image.")
+            return None
         self.taken.append(number)
         frame = self.frames[number % len(self.frames)]
         return self.times_s[number] if self.times_s else 0.1 * number, raw_depth(frame, 1.0), frame.colour
@@ -178,7 +165,7 @@ class StandIn(AbstractCamera):
 
 def test_images_are_taken_when_they_are_asked_for() -> None:
     camera = StandIn(small_frames(3))
-    sequence = begin(camera, first=2)
+    sequence = begin(camera.camera, first=2)
     assert sequence.live
     assert sequence.indices == (0, 1)
     assert len(survey(sequence.recorded()).indices) == 2
@@ -199,7 +186,7 @@ def test_images_are_taken_when_they_are_asked_for() -> None:
 
 def test_a_live_camera_stays_live_whatever_it_is_wrapped_in() -> None:
     camera = StandIn(small_frames(3))
-    sensed = CalibratedSequence(begin(camera, first=2), NoiseModel(0.5, 500.0, 0.001, (0.0, 0.0, 0.0)))
+    sensed = CalibratedSequence(begin(camera.camera, first=2), NoiseModel(0.5, 500.0, 0.001, (0.0, 0.0, 0.0)))
     assert sensed.live
     assert [frame.index for frame in sensed.recorded()] == [0, 1]
     assert len(camera.taken) == 2  # to look at what it has shown takes nothing from it
@@ -209,10 +196,10 @@ def test_a_live_camera_stays_live_whatever_it_is_wrapped_in() -> None:
 
 def test_an_image_that_comes_again_is_not_taken_for_a_new_one() -> None:
     camera = StandIn(small_frames(3), times_s=(0.0, 0.0, 0.1, 0.1, 0.1, 0.2, 0.3, *[0.3] * 200))
-    sequence = begin(camera, first=2)
+    sequence = begin(camera.camera, first=2)
     assert [frame.time_s for frame in itertools.islice(sequence, 4)] == [0.0, 0.1, 0.2, 0.3]
     with pytest.raises(InputError, match=r"stand-in: .*same image"):
-        list(begin(camera, first=2))
+        list(begin(camera.camera, first=2))
 
 
 def test_a_camera_of_the_makers_library_is_read_while_it_runs(
@@ -228,7 +215,7 @@ def test_a_camera_of_the_makers_library_is_read_while_it_runs(
     played = context.load_device(str(path))
     with pytest.raises(InputError, match=r"realsense:123: .* 0123456789\."):
         open_camera("123", Overrides(), context)
-    monkeypatch.setattr("modeler.sequences.live.PATIENCE_MS", 500)
+    monkeypatch.setattr("modeler.sequences.live.TIMEOUT_MS", 500)
     monkeypatch.setattr("modeler.sequences.live.FIRST", 4)
     sequence = open_camera("0123456789", Overrides(), context)
     assert (sequence.name, sequence.depth_unit) == ("Software D455", "0.25 mm (the camera)")
@@ -263,7 +250,7 @@ def test_recording_a_live_camera_needs_an_end(
     camera = StandIn(small_frames(3))
     monkeypatch.setattr(
         "modeler.sequences.open_sequence",
-        lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
+        lambda path, *_: begin(camera.camera, 2) if str(path) == "realsense:" else open_sequence(path),
     )
     assert main(["convert", "realsense:", "--out", str(tmp_path / "bop")]) == 2
     assert "limit the number of frames to record" in capsys.readouterr().err
@@ -278,7 +265,7 @@ def test_a_camera_that_is_unplugged_leaves_what_it_gave(
     camera, out = StandIn(small_frames(3), lasts=3), tmp_path / "out"
     monkeypatch.setattr(
         "modeler.sequences.open_sequence",
-        lambda path, *_: begin(camera, 2) if str(path) == "realsense:" else open_sequence(path),
+        lambda path, *_: begin(camera.camera, 2) if str(path) == "realsense:" else open_sequence(path),
     )
     assert main([command[0], "realsense:", "--out", str(out), *command[1:]]) in (0, 3)
     assert "modeler: stand-in: gives no image" in capsys.readouterr().err
