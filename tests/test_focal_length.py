@@ -26,8 +26,10 @@ from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequ
 from modeler.types import (
     AbstractPoseDensity,
     Array,
+    Camera,
     Edge,
     FocalLength,
+    Frame,
     ObjectModel,
     PoseGaussian,
     SensorNoise,
@@ -251,16 +253,22 @@ def test_covariances_are_those_of_a_graph_with_the_focal_length_as_a_variable(rn
         np.testing.assert_allclose(whiten @ widened.covariances[frame] @ whiten.T, np.eye(6), atol=0.04)
 
 
+def _halved(frame: Frame) -> Frame:
+    camera, mask = frame.camera, frame.mask
+    assert mask is not None
+    small = Camera(320, 240, camera.fx / 2, camera.fy / 2, camera.cx / 2, camera.cy / 2)
+    return replace(frame, depth_m=frame.depth_m[::2, ::2].copy(), camera=small, mask=mask[::2, ::2], colour=None)
+
+
 @cache
 def built(sigma_focal: float) -> tuple[Step, dict[int, Array]]:
-    """The last step of a run whose focal length is stated 3 % too long, and its true poses."""
+    """The last step of a run, at half the size, whose focal length is stated 3 % too long, and its true poses."""
     whole = open_sequence(bundled("box"))
     noise, truth = whole.sensor(), whole.truth()
     assert noise is not None
     assert truth is not None
-    wrong = RefocusedSequence(whole, FocalFactor(1.03, whole.frame(0).camera.fx))
+    frames = [_halved(frame) for frame in RefocusedSequence(whole, FocalFactor(1.03, whole.frame(0).camera.fx))]
     modeler = Modeler(sensor=Sensor(noise._replace(sigma_focal=sigma_focal)), prior=TablePrior())
-    frames = list(wrong)
     *_, last = modeler.run(frames, modeler.segmenter.scene(frames))
     assert isinstance(last, Step)
     return last, truth
