@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 CHAPTERS = ROOT / "docs" / "method"
 ROOMS = ("modeler", "sequences", "viz", "studies", "tests", "docs")
-MAX_WORDS = 9000
+MAX_WORDS = 8000
 _NUMBER = r"[A-Z]?\d+(?:\.\d+)?"
 _CITATION = re.compile(rf"\b[Ee]qs?\.\s+({_NUMBER}(?:(?:,\s+|\s+(?:and|or|to)\s+){_NUMBER})*)")
 _OTHER_SOURCE = re.compile(r"(paper|\b(19|20)\d\d),\s+\Z")  # before a citation

@@ -34,7 +34,7 @@ _AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])
 _PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # if edges already contain the direction
 _MAX_ITERATIONS, _MAX_HALVINGS = 50, 10  # of Gauss–Newton, and of one of its steps
 _TOLERANCE = 1e-6  # of half the squared Mahalanobis distance
-_CONFIDENCE = 1.0 - 1e-6  # of the gate: a false axis costs a hundred times more than a true one
+_CONFIDENCE = 1.0 - 1e-6  # of the gate: one of 100 runs of 100 solutions fails by chance
 
 
 def least_variance_point(factors: Sequence[Factor]) -> Array:

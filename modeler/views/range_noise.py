@@ -16,8 +16,8 @@ from scipy.ndimage import maximum_filter
 
 from modeler.types import Array, BoolArray, Float32Array, Frame
 
-_TILES_PX: Final = (48, 24)  # the first size with enough tiles: small tiles absorb widely correlated errors
-_MIN_TILES: Final = 10  # of a size
+_TILES_PX: Final = (48, 24)  # the first size with enough tiles: 24 px hold half of the area on captures, 96 px bends
+_MIN_TILES: Final = 10  # of a size; 5 or 20 give the same on captures
 _MARGIN_PX: Final = 8  # from the object and its mixed pixels
 _FRAMES: Final = 4  # more are redundant
 _NOT_PLANE: Final = 4.0  # times the median of the tiles' variances
