@@ -17,7 +17,7 @@ from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve, variance_factor
 from modeler.graph.covariance import chi_square_quantile
 from modeler.types import Array, Camera, Edge, Frame, PoseGaussian, RayImage, Solution
-from modeler.verdict.spreads import least_uncertain, spread_of_positions, spread_of_rotations
+from modeler.verdict.spreads import covariances_about_mean, spread_of_positions, spread_of_rotations
 from studies.loops import covariances
 
 SEEDS = 120
@@ -183,22 +183,42 @@ def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None
     alone, shifted = solve(graph, {}), solve(graph, {}, common_shift_m2=shift)
     seen = RayImage(Frame(0, 0.0, np.zeros((1, 1), np.float32), CAMERA), None, 0.0, 0.0, OBJECT_M[None], OBJECT_M[None],
                     np.zeros((1, 2), np.int64))  # fmt: skip
-    spreads = [spread_of_positions(dict.fromkeys(TRUTH, seen), solution, 0.005, 0) for solution in (alone, shifted)]
+    spreads = [
+        spread_of_positions(dict.fromkeys(TRUTH, seen), solution, covariances_about_mean(solution), 0.005)
+        for solution in (alone, shifted)
+    ]
     assert spreads[0] is not None
     assert spreads[1] is not None
     assert spreads[1].check.value == pytest.approx(spreads[0].check.value, rel=1e-6)
     assert np.trace(shifted.covariances[COUNT // 2][3:, 3:]) > 2.0 * np.trace(alone.covariances[COUNT // 2][3:, 3:])
 
 
-def test_a_model_is_judged_from_its_best_known_frame() -> None:
-    """Along a chain that is the middle one, from which the ends are half as far."""
+def test_errors_that_all_poses_share_are_none_of_the_model() -> None:
+    """Along a chain of n steps, ends are known from each other to √n, from the mean to about √(n / 3) of a step."""
     motion = PoseGaussian(spin([0.0, 0.3, 0.0]), np.diag(np.repeat([0.01, 0.002], 3) ** 2))
     solution = solve(PoseGraph(tuple(edge(k - 1, k, motion) for k in range(1, 9))), {})
-    assert least_uncertain(solution) == 4
-    ends = [spread_of_rotations(solution, reference) for reference in (0, 4)]
-    assert ends[0] is not None
-    assert ends[1] is not None
-    assert ends[1].check.value < 0.8 * ends[0].check.value
+    covariances = covariances_about_mean(solution)
+    for end in (0, 8):
+        np.testing.assert_allclose(covariances[end][:3, :3], 0.01**2 * 8 * 17 / 54 * np.eye(3), atol=1e-9)
+    found = spread_of_rotations(covariances)
+    assert found is not None
+    assert found.frame in (0, 8)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.8])
+def test_errors_from_the_mean_of_all_poses_are_calibrated(share: float) -> None:
+    values = []
+    for seed in range(100):
+        solution = solve(_graph(np.random.default_rng(seed), share), {}, shared=share)
+        moved = {
+            k: se3.adjoint(pose) @ se3.log(se3.inverse(pose) @ TRUTH[k]) for k, pose in solution.trajectory.items()
+        }
+        k = seed % COUNT
+        error = moved[k] - np.mean(list(moved.values()), axis=0)
+        to_object = se3.adjoint(solution.trajectory[k])
+        covariance = to_object @ covariances_about_mean(solution)[k] @ to_object.T
+        values.append(error @ np.linalg.solve(covariance, error))
+    assert np.mean(values) == pytest.approx(6.0, abs=TOLERANCE)
 
 
 def test_no_loop_tells_what_all_views_err_by() -> None:

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from modeler import se3
 from modeler.graph import PoseGraph, solve
-from modeler.priors import GeneralPrior, HeldPrior, ProductPrior, TablePrior, TurntablePrior
+from modeler.priors import AutoPrior, GeneralPrior, HeldPrior, ProductPrior, TablePrior, TurntablePrior
 from modeler.priors.mixtures import Gaussian
 from modeler.types import (
     AbstractPoseDensity,
@@ -49,7 +49,13 @@ from modeler.verdict.evidence import (
     prior_check,
     prior_distances,
 )
-from modeler.verdict.spreads import least_uncertain, misfit, one_axis_sd, spread_of_positions, spread_of_rotations
+from modeler.verdict.spreads import (
+    covariances_about_mean,
+    misfit,
+    one_axis_sd,
+    spread_of_positions,
+    spread_of_rotations,
+)
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 AXES_M = np.array([0.09, 0.05, 0.03])
@@ -234,6 +240,26 @@ def test_a_tilted_object_contradicts_its_table() -> None:
         assert against.check.holds is holds
 
 
+def test_limits_that_nobody_stated_contradict_nothing() -> None:
+    """A step of 80° off the table, the limits for several steps being 75°."""
+    for assumed in (True, False):
+        prior = AutoPrior(GeneralPrior(limits_assumed=assumed), TablePrior(limits_assumed=assumed))
+        views = views_of([0.0, 80.0], plane=TABLE)
+        tilt = MIDDLE @ se3.exp(np.array([np.radians(5.0), 0.0, 0.0, 0.0, 0.0, 0.0])) @ se3.inverse(MIDDLE)
+        poses = {0: np.eye(4), 1: poses_of([0.0, 80.0])[1] @ tilt}
+        against = contradiction(prior_distances([joined(1, 0, poses)], views, prior))
+        assert assumed is (against is not None and against.check.holds)
+
+
+def test_a_rotation_that_a_pair_leaves_open_contradicts_no_steps_that_the_graph_agrees_with() -> None:
+    views, poses = views_of([0.0, -25.0, -50.0]), poses_of([0.0, -25.0, -50.0])
+    anywhere = joined(2, 0, poses_of([0.0, 0.0, -20.0]), kind="span")
+    for solution, holds in ((None, False), (Solution(poses), True), (Solution(poses_of([0.0, 0.0, -20.0])), False)):
+        against = contradiction(prior_distances([anywhere], views, TurntablePrior(25.0), solution=solution))
+        assert against is not None
+        assert against.check.holds is holds
+
+
 @pytest.mark.parametrize(("step_deg", "alone", "together"), [(25.3, True, True), (28.5, True, False)])
 def test_a_step_given_wrongly_shows_in_all_pairs_together(step_deg: float, alone: bool, together: bool) -> None:
     angles_deg = [-step_deg * k for k in range(13)]
@@ -269,6 +295,16 @@ def test_loops_open_by_more_than_their_edges_state_speak_against_a_model() -> No
     assert loop_check(loop_closure_errors(edges[:-1], solution, {})) is None
 
 
+def test_a_loop_open_by_less_than_makes_a_pose_wrong_is_closed_however_precise_its_edges() -> None:
+    for off_deg, tolerance_m, holds in ((8.0, 1.0, False), (2.5, 1.0, True), (2.5, 1e-3, False)):
+        edges, solution = ring(off_deg)
+        sure = [replace(error, sigmas=10.0) for error in loop_closure_errors(edges, solution, {})]
+        far = [replace(error, translation_m=0.005) for error in sure]
+        worst = loop_check(far, tolerance_m)
+        assert worst is not None
+        assert worst[1].holds is holds
+
+
 def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
     edges, solution = ring(2.0)
     openings = loop_closure_errors(edges, solution, {})
@@ -291,6 +327,16 @@ def test_edges_that_contradict_each_other_speak_against_a_model() -> None:
     assert check is not None
     assert not check.holds
     assert misfit(spoilt_edges, solution) == pytest.approx(np.sqrt(check.value))
+    views = views_of([360.0 * k / 14.0 for k in range(15)])
+    check = graph_check(spoilt_edges, solution, views, tolerance_m=1.0)
+    assert check is not None
+    assert not check.holds  # 6° off
+    nearly = replace(edges[3].posterior, pose=replace(edges[3].posterior.pose, mean=poses_of([0.0, 24.0])[1]))
+    nearly_edges = [*edges[:3], replace(edges[3], posterior=nearly), *edges[4:]]
+    for seen_in, tolerance_m, holds in ((None, 0.0, False), (views, 0.001, False), (views, 0.005, True)):
+        check = graph_check(nearly_edges, solution, seen_in, tolerance_m)
+        assert check is not None
+        assert check.holds is holds  # 1.7° off, within what is called right
     assert misfit(edges, solution) >= 1.0
     assert graph_check(edges[:-1], solution) is None  # a tree contradicts nothing
     assert misfit(edges[:-1], solution) == 1.0
@@ -321,7 +367,9 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
             poses,
             {frame: away[frame] @ (spread if frame == 2 else ABOUT_OBJECT) @ away[frame].T for frame in poses},
         )
-        turn, place = spread_of_rotations(solution, 0), spread_of_positions(views, solution, 0.005, 0)
+        spread_from_first = covariances_about_mean(solution)  # no joint covariance is known
+        turn = spread_of_rotations(spread_from_first)
+        place = spread_of_positions(views, solution, spread_from_first, 0.005)
         assert turn is not None
         assert place is not None
         assert (turn.frame, turn.check.holds) == (2, turn_holds)
@@ -329,11 +377,11 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
         assert place.check.value == pytest.approx(np.hypot(sigma_m, 0.0005), rel=0.02)
         drawn_deg = np.abs(turn.check.value * rng.normal(size=20_000))
         assert bool(np.mean(drawn_deg > 3.0) < 0.05) is turn_holds
-    wider = spread_of_rotations(solution, 0, 2.0)
+    wider = spread_of_rotations(spread_from_first, 2.0)
     assert wider is not None
     assert 1.9 < wider.check.value / turn.check.value < 2.2
-    assert spread_of_rotations(Solution(), least_uncertain(Solution())) is None
-    assert spread_of_positions(views, Solution(), 0.005, None) is None
+    assert spread_of_rotations(covariances_about_mean(Solution())) is None
+    assert spread_of_positions(views, Solution(), {}, 0.005) is None
 
 
 @pytest.mark.parametrize("sigmas_deg", [(1.5, 0.0, 0.0), (1.5, 0.6, 0.5), (1.3, 1.3, 0.1), (1.0, 1.0, 1.0)])

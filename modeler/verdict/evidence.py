@@ -93,20 +93,30 @@ class Contradiction:
 
 
 def prior_distances(
-    edges: Sequence[Edge], views: Mapping[int, RayImage], prior: AbstractPrior, places: Mapping[int, int] | None = None
+    edges: Sequence[Edge],
+    views: Mapping[int, RayImage],
+    prior: AbstractPrior,
+    places: Mapping[int, int] | None = None,
+    solution: Solution | None = None,
 ) -> list[tuple[Edge, float]]:
     """Return edges with the distances Δ, in nats, from the prior's mode to the means of their posteriors.
 
+    For edges that do not hold the prior, to the pose that all edges together give if that is nearer: the mean of a
+    posterior that leaves a rotation open may be anywhere.
+
     Limits of a search, outside of which a density is zero, are those for several steps, because the search extends to
-    them. Edges to which the prior does not apply are left out, and those between segments.
+    them; limits that nobody stated are none. Edges to which the prior does not apply are left out, and those between
+    segments.
 
     Args:
         edges: those that take part.
         views: by frame number.
         prior: of the motions.
         places: by frame number, how many frames were read before; None: the number itself.
+        solution: the poses; None: means alone are compared.
     """
     found = []
+    prior = prior.unlimited() or prior
     for edge in edges:
         if edge.kind == "join" or edge.source not in views or edge.target not in views:
             continue
@@ -118,6 +128,8 @@ def prior_distances(
             continue
         posterior = edge.posterior
         means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
+        if solution is not None and edge.kind != "odometry":
+            means = np.concatenate([means, solution.relative(edge.target, edge.source)[None]])
         here = float(density.log_prior(means).max())
         if np.isfinite(here):  # not at a limit of the search, where the posterior is cut off
             found.append((edge, _distance_nats(density, here)))
@@ -166,25 +178,47 @@ def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
     return Check(sum(squared) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
 
 
-def loop_check(errors: Sequence[LoopClosureError]) -> tuple[LoopClosureError, Check] | None:
-    """Return the loop with the largest closure error in standard deviations, with its limit; None without a loop.
+def loop_check(errors: Sequence[LoopClosureError], tolerance_m: float = 0.0) -> tuple[LoopClosureError, Check] | None:
+    """Return the loop with the largest closure error by its limit, in standard deviations; None without a loop.
 
     The NEES of a closure error follows χ² with six degrees of freedom. For the largest of several loops, the tail
-    probability is at most their number times as large (Bonferroni).
+    probability is at most their number times as large (Bonferroni). A closure error that would not make a pose wrong if
+    it were that pose's is within the limit, however small its standard deviation.
+
+    Args:
+        errors: of all loops.
+        tolerance_m: error of the surface above which a model is wrong.
     """
     finite = [error for error in errors if np.isfinite(error.sigmas)]
     if not finite:
         return None
-    worst = max(finite, key=lambda error: error.sigmas)
-    return worst, Check(worst.sigmas, float(np.sqrt(chdtri(6, LOOP_TAIL / len(finite)) / 6.0)))
+    chance = float(np.sqrt(chdtri(6, LOOP_TAIL / len(finite)) / 6.0))
+    shares = [_wrong_share(error.rotation_rad, error.translation_m, tolerance_m) for error in finite]
+    checks = [
+        Check(error.sigmas, max(chance, error.sigmas / share)) for error, share in zip(finite, shares, strict=True)
+    ]
+    worst = max(range(len(finite)), key=lambda k: checks[k].value / checks[k].limit)
+    return finite[worst], checks[worst]
 
 
-def graph_check(edges: Sequence[Edge], solution: Solution) -> Check | None:
+def _wrong_share(rotation_rad: float, translation_m: float, tolerance_m: float) -> float:
+    """Return an error of a pose as a share of the least that is called wrong; always above 0."""
+    return float(max(rotation_rad / WRONG_RAD, translation_m / max(tolerance_m, 1e-12), 1e-12))
+
+
+def graph_check(
+    edges: Sequence[Edge], solution: Solution, views: Mapping[int, RayImage] | None = None, tolerance_m: float = 0.0
+) -> Check | None:
     """Return the edges' squared residuals in units of their covariances, per degree of freedom; None for a tree.
+
+    What they exceed chance by is part of the uncertainty of poses (`misfit`). The limit is that of chance, or that at
+    which some residual would make a pose wrong if it were that pose's error.
 
     Args:
         edges: those that take part.
         solution: the poses.
+        views: by frame number; None: the limit is that of chance.
+        tolerance_m: error of the surface above which a model is wrong.
     """
     freedom = 6 * (len(edges) - len(solution.trajectory) + 1)
     if freedom <= 0 or not edges:
@@ -196,7 +230,17 @@ def graph_check(edges: Sequence[Edge], solution: Solution) -> Check | None:
     ]
     xi = se3.log(np.stack(apart))
     whitened = np.linalg.solve(np.stack([pose.covariance for pose in poses]), xi[..., None])[..., 0]
-    return Check(float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
+    value, limit = float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom
+    if views is not None:
+        middles_m = [views[edge.source].centroid_m for edge in edges]
+        off_m = [
+            float(np.linalg.norm(se3.transform(motion, middle_m[None])[0] - middle_m))
+            for motion, middle_m in zip(apart, middles_m, strict=True)
+        ]
+        turned_rad = np.linalg.norm(xi[:, :3], axis=1)
+        share = max(_wrong_share(*both, tolerance_m) for both in zip(turned_rad, off_m, strict=True))
+        limit = max(limit, value / share**2)
+    return Check(value, limit)
 
 
 def default_tolerance_m(views: Sequence[RayImage], variance_factor: float = 1.0) -> float:

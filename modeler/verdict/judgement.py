@@ -48,7 +48,7 @@ from modeler.verdict.evidence import (
     prior_distances,
 )
 from modeler.verdict.spreads import (
-    least_uncertain,
+    covariances_about_mean,
     misfit,
     size_check,
     spread_of_positions,
@@ -155,7 +155,7 @@ def _found(
         )
         found.append(_Finding("motion_m", moved_m, "no_motion", words))
     places = {frame: place for place, frame in enumerate(sorted(frame.id for frame in frames))}
-    distances = [] if prior is None else prior_distances(edges, views, prior, places)
+    distances = [] if prior is None else prior_distances(edges, views, prior, places, solution)
     if (against := contradiction(distances)) is not None:
         words = (
             f"the images contradict the prior: from frame {against.target} to {against.source} the object moved "
@@ -169,11 +169,11 @@ def _found(
         )
         found.append(_Finding("prior_chi2", together, "prior_contradicted", words))
     centroids_m = {frame: view.centroid_m for frame, view in views.items()}
-    if (loop := loop_check(loop_closure_errors(step.edges_so_far, solution, centroids_m))) is not None:
+    if (loop := loop_check(loop_closure_errors(step.edges_so_far, solution, centroids_m), tolerance_m)) is not None:
         error, check = loop
         words = f"{error.words}: the focal length, the depth scale or an edge is wrong"
         found.append(_Finding("loop_sigmas", check, "loop_open", words))
-    if (fit := graph_check(edges, solution)) is not None:
+    if (fit := graph_check(edges, solution, views, tolerance_m)) is not None:
         words = (
             f"the edges contradict each other: their squared residuals are {fit.value:.1f} times those "
             f"expected from their covariances (up to {fit.limit:.1f} by chance)"
@@ -211,12 +211,12 @@ def _colour(step: Step) -> list[_Finding]:
 def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Finding]:
     """Return the uncertainty of the poses of a whole run."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
-    reference = least_uncertain(step.solution)
-    if (turn := spread_of_rotations(step.solution, reference, factor)) is not None:
+    covariances = covariances_about_mean(step.solution)
+    if (turn := spread_of_rotations(covariances, factor)) is not None:
         words = f"the rotation of frame {turn.frame} is uncertain by {turn.check.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.check.limit:.1f}°" if turn.count > 1 else ""
         found.append(_Finding("pose_sd_deg", turn.check, "unsure_rotation", words))
-    if (place := spread_of_positions(step.views, step.solution, tolerance_m, reference, factor)) is not None:
+    if (place := spread_of_positions(step.views, step.solution, covariances, tolerance_m, factor)) is not None:
         value_mm, limit_mm = 1000.0 * place.check.value, 1000.0 * place.check.limit
         words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
         words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""

@@ -14,7 +14,7 @@ from modeler import se3
 from modeler.types import Array, Check, Edge, FocalLength, RayImage, Solution
 from modeler.verdict.evidence import MAX_POINTS, MAX_VIOLATIONS, WRONG_RAD, WRONG_SHARE, graph_check
 
-_CANDIDATES: Final = 16  # for the frame that all others are compared with: 240 motions take a tenth of a second
+_MOST: Final = 16  # frames whose mean error is none of the model's: 240 motions take a tenth of a second
 _NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then accurate to 0.1 %
 
 
@@ -43,51 +43,64 @@ def misfit(edges: Sequence[Edge], solution: Solution) -> float:
     return 1.0 if fit is None else float(np.sqrt(max(fit.value, 1.0)))
 
 
-def least_uncertain(solution: Solution) -> int | None:
-    """Return the frame relative to which the rotations of all others are known best; None without a pose.
+def covariances_about_mean(solution: Solution) -> dict[int, Array]:
+    """Return the covariances (6, 6) of poses, in their cameras' coordinates, of errors that all poses do not share.
 
-    The model is the same relative to any of its frames, but an error of the first one would be one of all others.
-    Candidates are frames spread over the run, compared by the worst of each other's rotations.
-    """
-    frames = sorted(solution.trajectory)
-    if not solution.knows_motions or len(frames) < 2:
-        return min(frames, default=None)
-    some = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, _CANDIDATES).astype(np.int64)).tolist()]
-    worst = {
-        reference: max(
-            float(np.linalg.eigvalsh(_given_focal_length(solution, frame, reference)[:3, :3])[-1])
-            for frame in some
-            if frame != reference
-        )
-        for reference in some
-    }
-    return min(some, key=worst.__getitem__)
-
-
-def spread_of_rotations(solution: Solution, reference: int | None, factor: float = 1.0) -> Spread | None:
-    """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
-
-    What a wrong focal length does to the model is part of its size (`size_check`) and of `spread_of_positions`.
+    A motion of all poses together changes nothing of a model, so that errors are those from the mean error of frames
+    spread over the run. What is due to the focal length is left out: it is part of the model's size (`size_check`) and
+    of `spread_of_positions`.
 
     Args:
-        solution: the poses.
-        reference: the frame without error; None without a pose.
+        solution: the poses; without their joint uncertainty, errors are those relative to the first.
+    """
+    frames = sorted(solution.covariances)
+    if not solution.knows_motions or len(frames) < 2:
+        return {frame: _given_focal_length(solution, frame, None) for frame in frames}
+    some = _spread_over(frames)
+    to_object = {frame: se3.adjoint(solution.trajectory[frame]) for frame in frames}
+    apart = {
+        frame: {
+            other: to_object[frame] @ _given_focal_length(solution, frame, other) @ to_object[frame].T
+            for other in some
+            if other != frame
+        }
+        for frame in frames
+    }
+    # Of errors x with D(k, j) = cov(x_k - x_j): cov(x_k - x̄) = mean of D(k, j) - half the mean of D(i, j).
+    among = sum((apart[one][other] for one in some for other in apart[one]), np.zeros((6, 6))) / (2.0 * len(some) ** 2)
+    found = {}
+    for frame in frames:
+        of_mean = sum(apart[frame].values(), np.zeros((6, 6))) / len(some) - among
+        from_object = se3.adjoint(se3.inverse(solution.trajectory[frame]))
+        found[frame] = from_object @ of_mean @ from_object.T
+    return found
+
+
+def _spread_over(frames: Sequence[int]) -> list[int]:
+    """Return some of sorted frame numbers, spread over the run."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).astype(np.int64))
+    return [frames[k] for k in chosen.tolist()]
+
+
+def spread_of_rotations(covariances: Mapping[int, Array], factor: float = 1.0) -> Spread | None:
+    """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
+
+    Args:
+        covariances: `covariances_about_mean`.
         factor: on the standard deviations: `misfit`.
     """
-    if reference is None:
-        return None
-    sigmas_deg = {}
-    for frame in solution.covariances:
-        given_focal = _given_focal_length(solution, frame, reference)[:3, :3]
-        sigmas_deg[frame] = float(np.degrees(one_axis_sd(factor**2 * given_focal, WRONG_RAD)))
+    sigmas_deg = {
+        frame: float(np.degrees(one_axis_sd(factor**2 * covariance[:3, :3], WRONG_RAD)))
+        for frame, covariance in covariances.items()
+    }
     return _widest(sigmas_deg, float(np.degrees(WRONG_RAD)))
 
 
 def spread_of_positions(
     views: Mapping[int, RayImage],
     solution: Solution,
+    covariances: Mapping[int, Array],
     tolerance_m: float,
-    reference: int | None,
     factor: float = 1.0,
 ) -> Spread | None:
     """Return the largest uncertainty of the surface's position in a pose, in m; None without a pose.
@@ -98,18 +111,15 @@ def spread_of_positions(
     Args:
         views: by frame number; the position is that of a view's centroid.
         solution: the poses.
+        covariances: `covariances_about_mean`.
         tolerance_m: error of the surface above which a model is wrong.
-        reference: the frame without error; None without a pose.
         factor: on the standard deviations: `misfit`.
     """
-    if reference is None:
-        return None
     sigmas_m, deformed_m = {}, deformation_by_focal_length(views, solution)
-    for frame in solution.covariances:
+    for frame, covariance in covariances.items():
         if frame in views and len(views[frame].points_m):
-            given_focal = _given_focal_length(solution, frame, reference)
-            of_place = se3.covariance_about(given_focal, views[frame].centroid_m)[3:, 3:]
-            of_place = of_place - _of_common_shift(solution, frame, reference)
+            of_place = se3.covariance_about(covariance, views[frame].centroid_m)[3:, 3:]
+            of_place = of_place - _of_common_shift(solution, frame)
             given_m = one_axis_sd(factor**2 * of_place, tolerance_m)
             smooth_m = np.sqrt(solution.variance_factor) * views[frame].multipath_m
             sigmas_m[frame] = float(np.linalg.norm([given_m, deformed_m.get(frame, 0.0), smooth_m]))
@@ -117,14 +127,19 @@ def spread_of_positions(
     return None if widest is None else replace(widest, by_focal_m=deformed_m.get(widest.frame, 0.0))
 
 
-def _given_focal_length(solution: Solution, frame: int, reference: int) -> Array:
-    """Return the covariance (6, 6) of a frame's pose relative to another without what is due to the focal length."""
-    known = solution.knows_motions
-    covariance = solution.relative_covariance(reference, frame) if known else solution.covariances[frame]
+def _given_focal_length(solution: Solution, frame: int, reference: int | None) -> Array:
+    """Return the covariance (6, 6) of a frame's pose without what is due to the focal length.
+
+    Args:
+        solution: the poses.
+        frame: number of the frame.
+        reference: number of the frame without error; None: the first.
+    """
+    covariance = solution.covariances[frame] if reference is None else solution.relative_covariance(reference, frame)
     focal = solution.focal
     if focal is None or frame not in focal.by_focal:
         return covariance
-    apart = focal.by_focal[frame] - (focal.by_focal.get(reference, 0.0) if known else 0.0)
+    apart = focal.by_focal[frame] - (0.0 if reference is None else focal.by_focal.get(reference, 0.0))
     xi = focal.sigma * se3.adjoint(se3.inverse(solution.trajectory[frame])) @ apart  # eq. 10.6
     return covariance - np.outer(xi, xi)
 
@@ -157,11 +172,14 @@ def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solutio
     }
 
 
-def _of_common_shift(solution: Solution, frame: int, reference: int) -> Array:
+def _of_common_shift(solution: Solution, frame: int) -> Array:
     """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method, eq. 8.10)."""
     if solution.common_shift_m2 is None:
         return np.zeros((3, 3))
-    left = np.eye(3) - solution.trajectory[frame][:3, :3].T @ solution.trajectory[reference][:3, :3]
+    frames = sorted(solution.covariances)
+    others = _spread_over(frames) if solution.knows_motions else frames[:1]
+    mean = np.mean([solution.trajectory[other][:3, :3] for other in others], axis=0)
+    left = np.eye(3) - solution.trajectory[frame][:3, :3].T @ mean
     return np.asarray(left @ solution.common_shift_m2 @ left.T, dtype=np.float64)
 
 
