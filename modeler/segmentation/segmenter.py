@@ -112,20 +112,22 @@ class Segmenter:
     def segment(self, frame: Frame, scene: Scene) -> Segmentation:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
-        A frame's own mask is kept, within region and largest depth; it is UNSURE_MASK if it covers much of the support,
-        CUT_OFF if it goes on beyond the image.
-        For sparse measurements, the mask includes the gaps between those of the object. An object
-        of which its own mask leaves the rim out is modelled as far as it is seen.
+        A frame's own mask is kept, within region and largest depth; it is CUT_OFF if it goes on beyond the image. If it
+        covers much of the support, what noise does not tell from that is left out, or, if that is most of it, the mask
+        is UNSURE_MASK. For sparse measurements, the mask includes the gaps between those of the object. An object of
+        which its own mask leaves the rim out is modelled as far as it is seen.
         """
         frame = _interpolated(frame)
         if frame.mask is not None:
             mask = frame.mask & self._allowed(frame.depth_m)
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
-            loose = plane is not None and self._share_on(plane, frame, mask, scene.range_noise) > _LOOSE_SHARE
+            share = 0.0 if plane is None else self._share_on(plane, frame, mask, scene.range_noise)
+            if plane is not None and _LOOSE_SHARE < share <= 0.5:
+                mask = mask & ~self._on(plane, frame, scene.range_noise)
             stride = planning_stride(frame.camera)
             cut = is_cut(mask, edge_of(np.isfinite(_measured(frame)[::stride, ::stride])))
-            outcome = Outcome.UNSURE_MASK if loose else Outcome.CUT_OFF if cut else Outcome.CONVERGED
+            outcome = Outcome.UNSURE_MASK if share > 0.5 else Outcome.CUT_OFF if cut else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
@@ -205,12 +207,16 @@ class Segmenter:
         return bool(agreeing >= MOST * np.count_nonzero(np.isfinite(off)))
 
     def _share_on(self, plane: Plane, frame: Frame, mask: BoolArray, seen: RangeNoise | None) -> float:
-        """Return the share of a mask's measured pixels that lie on the support plane, by the noise that planes show."""
-        noise = self.noise if seen is None else DepthNoise(0.0, seen.pixel_sigma_inverse_per_m)
+        """Return the share of a mask's measured pixels that lie on the support plane."""
         stride = planning_stride(frame.camera)
-        points = _points(frame, stride)
-        points = points[mask[::stride, ::stride] & np.isfinite(points[..., 2])].astype(np.float64)
-        return float(np.mean(np.abs(plane.height_m(points)) < noise.tolerance_m(points[:, 2])))
+        measured = mask[::stride, ::stride] & (frame.depth_m[::stride, ::stride] > 0.0)
+        return float(np.mean(self._on(plane, frame, seen, stride)[measured]))
+
+    def _on(self, plane: Plane, frame: Frame, seen: RangeNoise | None, stride: int = 1) -> BoolArray:
+        """Return which pixels of a downsampled frame lie on the support plane, by the noise that planes show."""
+        noise = self.noise if seen is None else DepthNoise(0.0, seen.pixel_sigma_inverse_per_m)
+        points = _points(frame, stride).astype(np.float64)
+        return np.asarray(np.abs(plane.height_m(points)) < noise.tolerance_m(points[..., 2]))
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
         """Return the support plane around a masked object, if one is seen."""
