@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tabletop
@@ -9,11 +11,11 @@ from prior_cases import views
 
 from modeler import se3
 from modeler.closure import Closer
-from modeler.graph import Smoother
+from modeler.graph import PoseGraph, Smoother
 from modeler.pipeline.attempts import Search, predicted
 from modeler.pipeline.state import State
-from modeler.priors import AnyMotion, AutoPrior, GeneralPrior, TablePrior
-from modeler.types import PoseGaussian, Solution
+from modeler.priors import AnyMotion, AutoPrior, GeneralPrior, TablePrior, TurntablePrior
+from modeler.types import Edge, JoinsPrevious, Outcome, PoseGaussian, Posterior, Solution
 from modeler.views import Sensor
 
 
@@ -62,3 +64,66 @@ def test_pairs_are_registered_within_limits_that_hold_their_predicted_motion(
     motion = PoseGaussian(solution.relative(target.index, source.index), np.eye(6))
     found = predicted(Search(state, prior, Closer(), source, target.index), target.index, prior, motion)
     assert isinstance(found.known, GeneralPrior if kept else AnyMotion)
+
+
+def test_pairs_registered_anew_keep_the_steps_that_their_edges_hold() -> None:
+    """Those with the previous view; further pairs hold none, as edges in between do."""
+    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
+    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(3)}
+    placed = {k: poses[0] @ se3.inverse(poses[k]) for k in range(3)}
+    edges = []
+    for source, target in ((1, 0), (2, 1)):
+        motion = PoseGaussian(se3.inverse(placed[target]) @ placed[source], 1e-6 * np.eye(6))
+        posterior = Posterior(source, target, motion, Outcome.CONVERGED, overlap=0.9)
+        edges.append(Edge(posterior, "odometry", True, JoinsPrevious(Outcome.CONVERGED, 0.9)))
+    graph = PoseGraph(tuple(edges))
+    state = State(graph=graph, smoother=Smoother().to(graph), views=views, places={k: k for k in views})
+    prior = TurntablePrior(24.0, 1.0).learned(state.solution, state.graph.edges)
+    for source, target, evidence in ((1, 0, True), (2, 1, True), (2, 0, False)):
+        (attempt,) = Search(state, prior, Closer(), views[source], target).attempts("refine")
+        density = attempt.prior.between(views[source], views[target])
+        there = se3.inverse(placed[target]) @ placed[source]
+        off = se3.moved(there[None], np.array([0.0, np.radians(9.0), 0.0, 0.0, 0.0, 0.0]), views[source].centroid_m)
+        steps = density.log_prior(there[None]) - density.log_prior(off)
+        assert (steps > 20.0).all() if evidence else (np.abs(steps) < 1e-6).all()
+
+
+def test_pairs_that_turn_the_other_way_than_the_rest_are_in_doubt() -> None:
+    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
+    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(6)}
+    step = poses[0] @ se3.inverse(poses[1])
+    edges = []
+    for source in range(1, 6):
+        motion = PoseGaussian(se3.inverse(step) if source == 1 else step, 1e-6 * np.eye(6))
+        posterior = Posterior(source, source - 1, motion, Outcome.CONVERGED, overlap=0.9)
+        edges.append(Edge(posterior, "odometry", True, JoinsPrevious(Outcome.CONVERGED, 0.9)))
+    graph = PoseGraph(tuple(edges))
+    state = State(graph=graph, smoother=Smoother().to(graph), views=views, places={k: k for k in views})
+    prior = TurntablePrior(24.0, 1.0, step_sign="unknown")
+    doubtful = state.less_probable(prior, prior.learned(state.solution, graph.edges))
+    assert doubtful == [edges[0]]
+    mended = state.reregistered(
+        lambda pairs: [replace(edges[0].posterior, pose=replace(edges[0].posterior.pose, mean=step))], doubtful
+    )
+    np.testing.assert_allclose(mended.solution.relative(0, 1), step, atol=1e-9)
+    assert not mended.less_probable(prior, prior.learned(mended.solution, mended.graph.edges))
+
+
+def test_steps_about_no_common_axis_are_solved_without_one() -> None:
+    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
+    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(6)}
+    views = {k: replace(view, plane=None) for k, view in views.items()}
+    prior = TurntablePrior(24.0, 1.0)
+    for wobble_deg, fits in ((0.0, True), (3.0, False)):
+        rng, edges = np.random.default_rng(0), []
+        for source in range(1, 6):
+            tilt = np.append(np.radians(wobble_deg) * rng.normal(size=3), np.zeros(3))
+            step = se3.moved((poses[source - 1] @ se3.inverse(poses[source]))[None], tilt, views[source].centroid_m)[0]
+            spread = se3.covariance_about(1e-6 * np.eye(6), -views[source].centroid_m)
+            posterior = Posterior(source, source - 1, PoseGaussian(step, spread), Outcome.CONVERGED, overlap=0.9)
+            edges.append(Edge(posterior, "odometry", True, JoinsPrevious(Outcome.CONVERGED, 0.9)))
+        graph = PoseGraph(tuple(edges))
+        state = State(graph=graph, smoother=Smoother().to(graph), views=views, places={k: k for k in views})
+        assert (state.about_axis(prior) is not None) is fits
+        assert replace(state, spans=(edges[0],)).about_axis(prior) is None
+        assert state.about_axis(GeneralPrior()) is None

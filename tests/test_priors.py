@@ -152,7 +152,6 @@ def test_evidence_is_all_of_the_density_or_what_is_known_without_the_guess(name:
         "velocity",
         "features",
         "turntable that has learnt",
-        "turntable that knows which way round",
         "velocity on a table",
     ],
 )

@@ -27,6 +27,7 @@ from modeler.types import (
     Array,
     BoolArray,
     InputError,
+    JoinsPrevious,
     Mode,
     Outcome,
     PoseGaussian,
@@ -183,9 +184,15 @@ def _unlimited(search: Search, target: int) -> AbstractPrior | None:
 
 
 def _by_the_graph(search: Search, target: int) -> AbstractPrior:
-    """Return the prior with the graph's prediction of the motion between two of its views as a proposal."""
+    """Return the prior with the graph's prediction of the motion between two of its views as a proposal.
+
+    Steps are evidence for a pair whose edge already holds them: one with the previous view, registered anew.
+    """
+    ends = search.view.index, target
+    own = (edge.reason for edge in search.state.graph.accepted if (edge.source, edge.target) == ends)
+    placed = any(isinstance(reason, JoinsPrevious) for reason in own)
     motion = search.state.solution.relative_gaussian(target, search.view.index)
-    return predicted(search, target, search.prior, motion, far=True)
+    return predicted(search, target, search.following if placed else search.prior, motion, far=True)
 
 
 def _through_base(search: Search, target: int) -> AbstractPrior:

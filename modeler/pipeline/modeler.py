@@ -7,11 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar, final
 
-import numpy as np
-
 from modeler.closure import Closer, Placement
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
-from modeler.graph import CommonAxis, MovingGraph, estimate_focal_length, shared_noise, variance_factor
+from modeler.graph import MovingGraph, estimate_focal_length, shared_noise, variance_factor
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment
 from modeler.pipeline.pairs import Prepared, Registrations, prepare, without_limits
@@ -305,10 +303,10 @@ class Run:
                 yield from self._joined(segment)
 
     def refine(self) -> Iterator[Refining]:
-        """Register further pairs of views, whose edges make the poses more precise.
-
-        None if all steps share an axis: the noise common to the edges of a frame is not modelled together with it.
-        """
+        """Register further pairs of views, whose edges make the poses more precise; none if an axis fits all steps."""
+        tracker = self.modeler.tracker(self.state)
+        if doubtful := self.state.less_probable(self.modeler.prior, tracker.learned_prior):
+            self.state = self.state.reregistered(tracker.between_views, doubtful)
         for state, event in self._refinement(self.state):
             self.state = state
             yield event
@@ -344,7 +342,7 @@ class Run:
 
     def _refinement(self, state: State) -> Iterator[tuple[State, Refining]]:
         """Yield a state with the edges of the refinement so far."""
-        if self.modeler.prior.shared_axis(list(state.views.values())) is not None:
+        if state.about_axis(self.modeler.prior) is not None:
             return
         yield state, Refining(0, None)
         tracker, before = self.modeler.tracker(state), state.map_view
@@ -433,14 +431,12 @@ class Run:
             state, focal = self._with_focal_length(state, sigma)
         distance_sigma = self.modeler.common_distance if sigma > 0.0 else 0.0
         solved = partial(state.solved, focal=focal, distance_sigma=distance_sigma)
-        axis = self.modeler.prior.shared_axis(list(state.views.values()))
-        if axis is None:
-            factor = variance_factor(state.graph, state.solution, state.exact_share)
-            shared = shared_noise(state.graph, state.solution, factor)
-            self.state = solved(axis=None, shared=shared, common=self.modeler.common_noise, variance_factor=factor)
-        else:
-            tilt_rad, shift_m = axis.sigma_tilt_rad, axis.sigma_shift_m
-            self.state = solved(axis=CommonAxis(tilt_rad, shift_m, sigma_lift_m=np.inf))
+        if (about_axis := solved().about_axis(self.modeler.prior)) is not None:
+            self.state = about_axis
+            return
+        factor = variance_factor(state.graph, state.solution, state.exact_share)
+        shared = shared_noise(state.graph, state.solution, factor)
+        self.state = solved(shared=shared, common=self.modeler.common_noise, variance_factor=factor)
 
     def _with_focal_length(self, state: State, sigma: float) -> tuple[State, FocalLength]:
         """Return a state under the focal length estimated from its loops, and the estimate.

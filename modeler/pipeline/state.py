@@ -14,7 +14,17 @@ from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
 from modeler.registration.systematic import of_multipath
 from modeler.system.disk_arrays import ViewStore
-from modeler.types import Edge, FocalLength, InputError, PoseGaussian, Posterior, RayImage, Solution
+from modeler.types import (
+    AbstractPrior,
+    Edge,
+    FocalLength,
+    InputError,
+    JoinsPrevious,
+    PoseGaussian,
+    Posterior,
+    RayImage,
+    Solution,
+)
 from modeler.views import Sensor
 
 _READY_BYTES, _MIN_READY = 128 * 2**20, 8  # of views whose images stay in memory: 13 of 640 × 480, at least 8
@@ -174,34 +184,57 @@ class State:
         smoother = replace(self.smoother, focal=None).to(graph)
         return replace(self, graph=graph, smoother=smoother, views=views, ready=ready, newest=newest, spans=spans)
 
-    def reregistered(self, register: Callable[[Sequence[tuple[int, int]]], Iterable[Posterior]]) -> State:
-        """Return the state with accepted edges registered again, replacing those whose new pose is consistent.
+    def reregistered(
+        self, register: Callable[[Sequence[tuple[int, int]]], Iterable[Posterior]], edges: Sequence[Edge] | None = None
+    ) -> State:
+        """Return the state with accepted edges registered again.
 
         Args:
             register: returns the posteriors of pairs (source, target) of its views.
+            edges: those in doubt; None: all of one mode, which are replaced if the new pose is consistent.
         """
-        unimodal = [edge for edge in self.graph.accepted if edge.kind != "join" and not edge.posterior.modes]
-        found = register([(edge.source, edge.target) for edge in unimodal])
+        some = edges or [edge for edge in self.graph.accepted if edge.kind != "join" and not edge.posterior.modes]
+        found = register([(edge.source, edge.target) for edge in some])
         new = {
             edge: replace(edge, posterior=posterior.without_samples())
-            for edge, posterior in zip(unimodal, found, strict=True)
-            if posterior.usable and not posterior.modes and _same_place(edge.posterior.pose, posterior.pose)
+            for edge, posterior in zip(some, found, strict=True)
+            if posterior.usable
+            and (edges or (not posterior.modes and _same_place(edge.posterior.pose, posterior.pose)))
         }
         graph = replace(self.graph, edges=tuple(new.get(edge, edge) for edge in self.graph.edges))
         spans = tuple(new.get(edge, edge) for edge in self.spans)
         return replace(self, graph=graph, spans=spans, smoother=self.smoother.to(graph))
 
+    def less_probable(self, prior: AbstractPrior, learned: AbstractPrior) -> list[Edge]:
+        """Return edges with previous views, a mode of which is less probable by what was learned from all: their sense.
+
+        Args:
+            prior: with which they were registered.
+            learned: the same with what was learned since.
+        """
+        found = []
+        for edge in self.graph.accepted:
+            if not isinstance(edge.reason, JoinsPrevious):
+                continue
+            views = self.views[edge.source], self.views[edge.target]
+            means = np.stack([mode.pose.mean for mode in edge.posterior.modes] or [edge.posterior.pose.mean])
+            before, after = (
+                which.following(edge.target).between(*views).log_prior(means) for which in (prior, learned)
+            )
+            if (after[np.isfinite(before)] < before[np.isfinite(before)] - 1.0).any():
+                found.append(edge)
+        return found
+
     def solved(
         self,
         *,
-        axis: CommonAxis | None,
         shared: float = 0.0,
         common: float = 0.0,
         focal: FocalLength | None = None,
         distance_sigma: float = 0.0,
         variance_factor: float = 1.0,
     ) -> State:
-        """Return the state solved with a common axis or shared noise, and a focal length; see `Smoother`.
+        """Return the state solved with shared noise and a focal length; see `Smoother`.
 
         `variance_factor` is on the covariances of edges; `distance_sigma` is the standard deviation of the error of all
         distances, as a share of that of the surface.
@@ -214,7 +247,6 @@ class State:
             shift = sigma**2 * np.outer(middle_m, middle_m) if sigma > 0.0 else None
         smoother = replace(
             self.smoother,
-            axis=axis,
             shared=shared,
             common=common,
             focal=focal,
@@ -222,6 +254,18 @@ class State:
             variance_factor=variance_factor,
         )
         return replace(self, smoother=smoother.to(self.graph))
+
+    def about_axis(self, prior: AbstractPrior) -> State | None:
+        """Return the state solved with the axis that all steps share by a prior; None if they share none, or none fits.
+
+        Nor with edges of the refinement: noise common to the edges of a frame is not modelled together with an axis.
+        """
+        shared = prior.shared_axis(list(self.views.values()))
+        if shared is None or self.spans:
+            return None
+        axis = CommonAxis(shared.sigma_tilt_rad, shared.sigma_shift_m, sigma_lift_m=np.inf)
+        about_axis = replace(self, smoother=replace(self.smoother, axis=axis).to(self.graph))
+        return None if about_axis.solution.camera_from_axis is None else about_axis
 
     @property
     def exact_share(self) -> float:

@@ -16,7 +16,8 @@ _MIN_PAIRS, _MAX_PAIRS = 3, 60  # of many, the latest suffice
 MIN_TURN_RAD = np.radians(5.0)  # below, a turn says little of its axis
 _FREEDOM = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
 _ITERATIONS = 30
-_DECISIVE_LOG_ODDS = np.log(500.0)  # log odds from which the sense counts as known: three certain pairs yield 9³
+UNDECIDED = 1.0 / 500.0
+"""Probability of the opposite sense below which the sense counts as known: three certain pairs leave 9⁻³."""
 _MAX_LOG_ODDS = np.log(9.0)  # bound on the log odds of one pair, which may have missed the true mode
 
 
@@ -115,7 +116,7 @@ def turn_sense(posteriors: Sequence[Posterior], up: Array, step_rad: float, sigm
         turn_rad, variance = steps * step_rad, abs(steps) * sigma_step_rad**2
         forward, backward = (_log_likelihood(posterior, up, turn, variance) for turn in (turn_rad, -turn_rad))
         odds += float(np.clip(forward - backward, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))
-    return int(np.sign(odds)) if abs(odds) > _DECISIVE_LOG_ODDS else 0
+    return int(np.sign(odds)) if abs(odds) > -np.log(UNDECIDED) else 0
 
 
 def _log_likelihood(posterior: Posterior, up: Array, turn_rad: float, variance: float) -> float:

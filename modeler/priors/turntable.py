@@ -11,7 +11,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors.checks import check_parameters
-from modeler.priors.common_axis import Axis, common_axis, turn_sense
+from modeler.priors.common_axis import UNDECIDED, Axis, common_axis, turn_sense
 from modeler.priors.general import GeneralPrior, centroid_offset, offset_limit_m, reach_deg, turned_offset_m
 from modeler.priors.mixtures import NODES, defensive_mixture, directions_about
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, TablePrior, no_plane, sample_disc, support
@@ -52,15 +52,15 @@ class AxisTurn:
     """Standard deviation of the axis' direction, about each direction orthogonal to it; infinite: any direction."""
     sigma_wobble_rad: float
     """Standard deviation of the rotation's remainder, about each direction orthogonal to the axis."""
-    unknown_sign: bool = False
-    """Whether the sign of the turn is unknown."""
+    opposite: float = 0.0
+    """Probability (0..1) that the turn has the opposite sign."""
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw rotations (count, 3, 3)."""
         offsets, _, cumulative = self._turns
         turn = self.turn_rad + np.interp(rng.random(count), cumulative, offsets)
-        if self.unknown_sign:
-            turn = turn * rng.choice([-1.0, 1.0], count)
+        if self.opposite:
+            turn = turn * rng.choice([-1.0, 1.0], count, p=[self.opposite, 1.0 - self.opposite])
         concentration = np.maximum(self._concentration(spread(turn)), 1e-9)
         axes = directions_about(self.axis, concentration, count, rng)
         return se3.exp(np.concatenate([turn[:, None] * axes, np.zeros((count, 3))], axis=1))[:, :3, :3]
@@ -100,9 +100,10 @@ class AxisTurn:
     def _log_turn(self, angle_rad: Array) -> Array:
         """Return the log density (n,) of turns by angles (n,) on the circle."""
         forward = self._log_wrapped(angle_rad - self.turn_rad)
-        if not self.unknown_sign:
+        if not self.opposite:
             return forward
-        return np.logaddexp(forward, self._log_wrapped(angle_rad + self.turn_rad)) - np.log(2.0)
+        backward = self._log_wrapped(angle_rad + self.turn_rad)
+        return np.logaddexp(forward + np.log1p(-self.opposite), backward + np.log(self.opposite))
 
     def _log_wrapped(self, offset_rad: Array) -> Array:
         offset = offset_rad - 2.0 * np.pi * np.rint(offset_rad / (2.0 * np.pi))
@@ -283,8 +284,8 @@ class TurntablePrior(AbstractPrior):
     learned_axis: Axis | None = None
     """The common axis of the pairs so far, used as a proposal."""
     sense: int = 0
-    """Sense of rotation of the pairs so far, +1 right-handed about the axis, if `step_sign` is unknown; used as a
-    proposal. 0: undetermined."""
+    """Sense of rotation of the pairs so far, +1 right-handed about the axis, if `step_sign` is unknown: one for all
+    steps. 0: undetermined."""
     previous: int | None = None
     """The frame relative to which a new one is placed: steps from it are evidence, others are not; None: all are."""
 
@@ -303,10 +304,8 @@ class TurntablePrior(AbstractPrior):
             raise no_plane(source, target)
         axis = self._axis(plane)
         density = self._density(source, target, axis)
-        if self.learned_axis is not None or self.sense:
-            step_deg = self.sense * abs(self.step_deg)
-            directed = replace(self, step_sign="known", step_deg=step_deg) if self.sense else self
-            density = defensive_mixture(density, [directed._density(source, target, self.learned_axis or axis)])
+        if self.learned_axis is not None:
+            density = defensive_mixture(density, [self._density(source, target, self.learned_axis)])
         if self.previous is None or target.index == self.previous:
             return density
         # The steps to an earlier view are already part of the edges in between; here they are only a proposal.
@@ -365,11 +364,11 @@ class TurntablePrior(AbstractPrior):
         steps = target.index - source.index
         turn = AxisTurn(
             axis=side * axis.direction,
-            turn_rad=float(np.radians(steps * self.step_deg)),
+            turn_rad=float(np.radians(steps * (self.sense * abs(self.step_deg) or self.step_deg))),
             sigma_turn_rad=max(float(np.radians(self.step_sigma_deg) * np.sqrt(max(abs(steps), 1))), _FLOOR),
             sigma_axis_rad=axis.sigma_direction_rad,
             sigma_wobble_rad=max(float(np.radians(self.wobble_deg)), _FLOOR),
-            unknown_sign=self.step_sign == "unknown",
+            opposite=0.0 if self.step_sign == "known" else UNDECIDED if self.sense else 0.5,
         )
         return AboutAxis(
             turn=turn,
