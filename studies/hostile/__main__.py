@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -26,21 +27,21 @@ import numpy as np
 
 from modeler.kernels import cache
 from modeler.runs.compiling import compile_kernels
-from modeler.sequences import bundled
+from modeler.sequences import write_bop
+from studies.formats.image_folders import small_frames, small_truth
 
-_BOX: Final = str(bundled("box"))
-_FEW: Final = ("--prior", "table", "--method", "icp", "--frames", ":3")
+_FEW: Final = ("--prior", "table", "--method", "icp")
 COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
-    "info": ("info", _BOX),
-    "register": ("register", _BOX, "0", "1", "--prior", "table", "--method", "icp"),
-    "build": ("build", _BOX, "--out", "{out}/run", *_FEW),
-    "batch": ("batch", _BOX, "--out", "{out}/runs", "--workers", "1", *_FEW),
-    "convert": ("convert", _BOX, "--out", "{out}/scene"),
+    "info": ("info", "{scene}"),
+    "register": ("register", "{scene}", "0", "1", "--prior", "table", "--method", "icp"),
+    "build": ("build", "{scene}", "--out", "{out}/run", *_FEW),
+    "batch": ("batch", "{scene}", "--out", "{out}/runs", "--workers", "1", *_FEW),
+    "convert": ("convert", "{scene}", "--out", "{out}/scene"),
     "report": ("report", "{run}", "--out", "{out}/report.html"),
     "export": ("export", "{run}", "--out", "{out}/model.obj"),
     "suggest": ("suggest", "{run}"),
 }
-"""Arguments; `{out}` is an empty folder, `{run}` a finished run."""
+"""Arguments; `{out}` is an empty folder, `{scene}` a sequence of three small frames, `{run}` its model."""
 _MODULES: Final = ("numpy", "json", "rerun", "numba", "pyarrow", "modeler", "sitecustomize", "encodings")
 _SETTINGS: Final = {
     "NUMBA_OPT": ("0", "nonsense"),
@@ -66,6 +67,7 @@ _LIMITS: Final = ("-n 8", "-n 40", "-n 300", "-f 100", "-f 2000", "-v 400000", "
 _ENDED: Final = (0, 2, 3)
 _LIMIT_S: Final = 150.0  # with kernels to compile; where the machine is idle, as below
 _LEAVES_S: Final = 10.0  # after a signal
+_CHILDREN_S: Final = 1.0  # after the command
 
 
 @dataclass
@@ -189,12 +191,12 @@ def outcome(trial: Trial, command: tuple[str, ...]) -> str:
             process.wait(_busy() * (_LIMIT_S if trial.signalled is None else _LEAVES_S))
         except subprocess.TimeoutExpired:
             fault = f"does not end in {time.monotonic() - began_s:.0f} s"
-        time.sleep(0.2 * _busy())
-        try:
+        until_s = time.monotonic() + _busy() * _CHILDREN_S
+        while process.poll() is not None and _members(process.pid) and time.monotonic() < until_s:
+            time.sleep(0.05)
+        if left := _members(process.pid):
+            fault = fault or f"leaves a process behind: {'; '.join(left)}"
             os.killpg(process.pid, signal.SIGKILL)
-            fault = fault or "leaves a process behind"
-        except ProcessLookupError:
-            pass
         process.wait()
         said.seek(0)
         words = said.read().decode(errors="replace")
@@ -205,6 +207,17 @@ def outcome(trial: Trial, command: tuple[str, ...]) -> str:
     if "Traceback" in words or "panicked" in words or process.returncode not in allowed:
         return f"ends with status {process.returncode}: {words[-400:]}"
     return "runs a file of the current folder" if (trial.folder / "ran").exists() else ""
+
+
+def _members(group: int) -> list[str]:
+    """Return the command lines of the processes of a group that run; those that nobody has buried yet do not."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError):  # it has ended meanwhile
+            state, _, number = (entry / "stat").read_text().rpartition(")")[2].split()[:3]
+            if entry.name.isdecimal() and int(number) == group and state not in "ZX":
+                found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:200])
+    return found
 
 
 def _busy() -> float:
@@ -228,7 +241,9 @@ def main() -> int:
     compile_kernels(print)
     root = str(Path(cache.__file__).parents[2])
     environment = {**os.environ, "PYTHONPATH": root}
-    built = [sys.executable, "-m", "modeler", "build", _BOX, "--out", str(out / "run"), *_FEW]
+    scene, run = out / "scene", out / "run"
+    write_bop(scene, small_frames(3), small_truth(3), depth_scale_mm=1.0)
+    built = [sys.executable, "-m", "modeler", "build", str(scene), "--out", str(run), *_FEW]
     assert subprocess.run(built, env=environment, check=False, stderr=subprocess.DEVNULL).returncode in _ENDED
     began_s, failed, count = time.monotonic(), 0, 0
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -247,7 +262,7 @@ def main() -> int:
             if name == "build" and rng.random() < 0.3:
                 trial.options = ("--connect", address)
                 trial.said.append("a silent viewer")
-            command = tuple(word.format(out=folder / "out", run=out / "run") for word in COMMANDS[name])
+            command = tuple(word.format(out=folder / "out", scene=scene, run=run) for word in COMMANDS[name])
             fault = outcome(trial, command)
             failed += bool(fault)
             print(f"{count:4d} {name:9} {'; '.join(trial.said):60} {fault or 'ended well'}", flush=True)
