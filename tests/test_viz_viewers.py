@@ -135,7 +135,8 @@ def test_a_viewer_that_freezes_does_not_stop_the_run(
 
 
 _STREAM = """\
-import resource, socket, sys
+import os, resource, signal, socket, sys, threading
+from modeler.cli.console import endable
 from modeler.viz import destinations
 from modeler.viz.stream import open_stream
 from turning_box import steps
@@ -143,22 +144,25 @@ from pathlib import Path
 
 silent = socket.create_server(("127.0.0.1", 0))
 watched = f"rerun+http://127.0.0.1:{silent.getsockname()[1]}/proxy" if sys.argv[3:] else None
-destinations._PATIENCE_S = 0.2
+destinations._PATIENCE_S = 30.0 if sys.argv[4:] else 0.2
 stream = open_stream("box", save=Path(sys.argv[1]), connect=watched)
 most = int(sys.argv[2]) or resource.RLIM_INFINITY
 resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
 for step in steps(2):
     stream(step)
-stream.close()
+if sys.argv[4:]:
+    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGHUP)).start()
+with endable():
+    stream.close()
 """
 
 
-def streamed(path: Path, *options: str) -> str:
+def streamed(path: Path, *options: str, status: int = 0) -> str:
     """Stream a run to a file in a process of its own, and return what that says."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     arguments = [sys.executable, "-c", _STREAM, str(path), *options]
     ended = subprocess.run(arguments, stderr=subprocess.PIPE, text=True, timeout=60.0, check=False, env=environment)
-    assert ended.returncode == 0, ended.stderr
+    assert ended.returncode == status, ended.stderr
     return ended.stderr
 
 
@@ -176,6 +180,12 @@ def test_a_disk_that_fills_at_any_piece_does_not_hold_the_process(
 def test_a_viewer_that_accepts_and_stays_silent_does_not_hold_the_process(tmp_path: Path) -> None:
     streamed(tmp_path / "r.rrd", "0", "watched")
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0, 1}
+
+
+def test_a_signal_while_a_silent_viewer_is_waited_for_ends_the_process(tmp_path: Path) -> None:
+    began_s = time.monotonic()
+    streamed(tmp_path / "r.rrd", "0", "watched", "ended", status=128 + signal.SIGHUP)
+    assert time.monotonic() - began_s < 25.0
 
 
 def test_a_viewer_that_is_far_behind_is_left_out(caplog: pytest.LogCaptureFixture, monkeypatch: Any) -> None:

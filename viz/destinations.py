@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import queue
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -69,7 +70,7 @@ class RecordingFile:
         leave.start()
         if not _ended((leave, self._copying), _DISK_PATIENCE_S, lambda: self._written):
             self.error = self.error or TimeoutError("the disk does not answer")
-            _let_go()
+            let_go()
         if self.error is not None:
             why = self.error.strerror or self.error
             _log.warning("%s: is truncated (%s); the other files do not depend on it", self.path, why)
@@ -121,7 +122,7 @@ class Shown:
             self._behind = True
             end_hung()
             if not _ended((self._sending,), _STOP_S, lambda: 0):
-                _let_go()
+                let_go()
 
     def _send(self) -> None:
         while (act := self._waiting.get()) and not self._behind:
@@ -139,8 +140,9 @@ def _ended(threads: tuple[threading.Thread, ...], patience_s: float, progress: C
     return not any(thread.is_alive() for thread in threads)
 
 
-def _let_go() -> None:
+def let_go() -> None:
     """Let the process end without what Rerun still has: its exit hook would wait for that for ever."""
-    import rerun as rr
+    if "rerun" in sys.modules:
+        import rerun as rr
 
-    rr.unregister_shutdown()
+        rr.unregister_shutdown()
