@@ -19,6 +19,11 @@ FARTHEST_M = 100.0
 """Range of the median depth; beyond, the unit is wrong."""
 
 
+PLAUSIBLE_M = (0.1, 5.0)
+"""Beyond these it is refused, unless the unit is given as an option: cameras for close range measure from 0.07 m, and
+objects farther than 5 m are not turned."""
+GIVEN_UNIT = "`depth_scale_mm`"
+"""What the source of a unit says that is given as an option; of a program's own arrays, in m, it says nothing."""
 LIKELY_M = (0.25, 5.0)
 """Half of a camera's depth lies within these limits when it watches an object; elsewhere the unit may be wrong."""
 OFF_MIDDLE = 0.1
@@ -26,6 +31,8 @@ OFF_MIDDLE = 0.1
 exchanged."""
 FAR_OFF_MIDDLE = 0.3
 """Beyond such a share no camera has it, but intrinsics of larger images do."""
+MUCH_NEARER = 0.25
+"""If exchanging cx and cy brings it nearer to the middle by this factor, they are exchanged."""
 USUAL_FIELD_DEG = (1.0, 135.0)
 """Fields of view of depth cameras, crops included."""
 WIDEST_FIELD_DEG = 170.0
@@ -82,6 +89,8 @@ class Survey:
     """Of the images and the camera of each frame, by its number."""
     flat: tuple[float, float] = (0.0, 0.0)
     """Shares (0..1) of the pixels on the largest plane if depth is along the optical axis, and if along the ray."""
+    unit: str = ""
+    """Unit of stored depth, and its source."""
     misaligned: Misalignment | None = None
     """Where colour is instead of where depth is; None if it is aligned, or edges do not tell."""
 
@@ -107,7 +116,9 @@ class Survey:
     def plain_errors(self) -> tuple[str, ...]:
         """What depth or colour plainly are not, in words."""
         axis, ray = self.flat
-        found = []
+        found = [words for camera in self.cameras[:1] for words, sure in _on_principal_point(camera) if sure]
+        if not PLAUSIBLE_M[0] <= self.range_m[1] <= PLAUSIBLE_M[1] and GIVEN_UNIT not in self.unit and self.unit != "m":
+            found.append(_on_unit(self.range_m[1]))
         if ray > max(LEAST_FLAT, BENT * axis):
             found.append(
                 f"depth is the distance along the ray, as renderers write it: so {ray:.0%} of it lie on one plane, "
@@ -131,11 +142,7 @@ class Survey:
         """Likely errors, in words, in order of importance."""
         middle_m, doubts = self.range_m[1], list[str]()
         if not LIKELY_M[0] <= middle_m <= LIKELY_M[1]:
-            what = "near" if middle_m < LIKELY_M[0] else "far"
-            doubts.append(
-                f"half of the depth lies within {middle_m:.2f} m, very {what} for an object: is the unit right? "
-                "If not, convert with `depth_scale_mm`"
-            )
+            doubts.append(_on_unit(middle_m))
         if self.misaligned is not None:
             doubts.append(_on_colour(self.misaligned))
         for camera in self.cameras:
@@ -147,19 +154,7 @@ class Survey:
                     f"{fields_deg[1]:.1f}°: are the focal lengths right?"
                 )
                 break
-        for camera in self.cameras[:1]:
-            off_px, swapped_px = (
-                float(np.hypot(x - camera.width / 2, y - camera.height / 2))
-                for x, y in ((camera.cx, camera.cy), (camera.cy, camera.cx))
-            )
-            longer_px = max(camera.width, camera.height)
-            exchanged = swapped_px < off_px and off_px > OFF_MIDDLE * longer_px
-            if exchanged or off_px > FAR_OFF_MIDDLE * longer_px:
-                question = "cx and cy exchanged" if exchanged else "the intrinsics those of images of another size"
-                doubts.append(
-                    f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the middle of "
-                    f"the images: are {question}?"
-                )
+        doubts += [words for camera in self.cameras[:1] for words, _ in _on_principal_point(camera)]
         doubts += [error for error in self.plain_errors if error not in doubts]
         if self.noise > MOST_NOISE:
             doubts.append(
@@ -245,6 +240,7 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
         truths=(0 if poses is None else len(poses)) if truth else None,
         digests=digests,
         flat=flat_shares(inspected),
+        unit=sequence.depth_unit,
         misaligned=misalignment([frame for frame in inspected if frame.camera == inspected[0].camera]),
     )
 
@@ -307,6 +303,31 @@ def _digest(frame: Frame) -> str:
     for image in (frame.depth_m, frame.mask, frame.colour, frame.occluder):
         digest.update(b"none" if image is None else np.ascontiguousarray(image).tobytes())
     return digest.hexdigest()
+
+
+def _on_principal_point(camera: Camera) -> list[tuple[str, bool]]:
+    """Return what is odd about a principal point in words, and whether it is plainly wrong; nothing if nothing is."""
+    off_px, swapped_px = (
+        float(np.hypot(x - camera.width / 2, y - camera.height / 2))
+        for x, y in ((camera.cx, camera.cy), (camera.cy, camera.cx))
+    )
+    longer_px = max(camera.width, camera.height)
+    exchanged, far = swapped_px < off_px and off_px > OFF_MIDDLE * longer_px, off_px > FAR_OFF_MIDDLE * longer_px
+    if not (exchanged or far):
+        return []
+    question = "cx and cy exchanged" if exchanged else "the intrinsics those of images of another size"
+    words = (
+        f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the middle of the images: "
+        f"are {question}? Correct them, or give `intrinsics`"
+    )
+    return [(words, far or swapped_px < MUCH_NEARER * off_px)]
+
+
+def _on_unit(middle_m: float) -> str:
+    return (
+        f"half of the depth lies within {middle_m:.2f} m, very {'near' if middle_m < LIKELY_M[0] else 'far'} for an "
+        "object: is the unit right? Give it as `depth_scale_mm`"
+    )
 
 
 def _on_colour(found: Misalignment) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,6 +136,40 @@ def test_the_gravest_doubt_comes_first(tmp_path: Path) -> None:
     assert len(found.doubts) == len(words)
     for doubt, some in zip(found.doubts, words, strict=True):
         assert some in doubt
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda facts: facts | {"depth_scale": 0.1 * facts["depth_scale"]}, "is the unit right?"),
+        (lambda facts: facts | {"depth_scale": 10.0 * facts["depth_scale"]}, "is the unit right?"),
+        (lambda facts: facts | {"cx": facts["cy"], "cy": facts["cx"]}, "are cx and cy exchanged?"),
+        (lambda facts: {name: 2.0 * value for name, value in facts.items()} | {"depth_scale": 1.0}, "of another size?"),
+    ],
+)
+def test_units_and_principal_points_that_are_plainly_wrong_are_refused(
+    tmp_path: Path,
+    frames: list[Frame],
+    capfd: pytest.CaptureFixture[str],
+    change: Callable[[dict[str, float]], dict[str, float]],
+    says: str,
+) -> None:
+    folder, camera = tmp_path / "s", frames[0].camera
+    facts = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "depth_scale": 1.0}
+    for frame in frames:
+        save(folder / "depth" / f"{frame.index}.png", raw_depth(frame, 1.0))
+    (folder / "camera.json").write_text(json.dumps(facts))
+    assert not survey(open_sequence(folder)).plain_errors
+    (folder / "camera.json").write_text(json.dumps(change(facts)))
+    (error,) = survey(open_sequence(folder)).plain_errors
+    assert says in error
+    assert main(["build", str(folder), "--out", str(tmp_path / "run")]) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1
+    assert said.endswith("(or --despite-doubts)\n")
+    assert says in said
+    given = Overrides((camera.fx, camera.fy, camera.cx, camera.cy), change(facts)["depth_scale"])
+    assert not survey(open_sequence(folder, given)).plain_errors
 
 
 def packed(image: np.ndarray) -> bytes:
