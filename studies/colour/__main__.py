@@ -12,18 +12,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import sys
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import numba
-
-from studies.colour.study import PARTS, SEEDS, Case, cases, measured
+from studies.colour.study import PARTS, SEEDS, cases, measured
 from studies.colour.tables import text
 from studies.results_file import earlier_results
+from studies.side_by_side import results
 
 _DATA: Final = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -45,26 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     path = options.out / f"{options.half}.jsonl"
     done = {one["key"]: one for one in map(json.loads, earlier_results(path))}
     wanted = cases(options.half, tuple(options.parts), options.data)
+    work = [partial(measured, case, options.data) for case in wanted if case.key not in done]
     with path.open("a") as stream:
-        for one in _outcomes([case for case in wanted if case.key not in done], options.data, options.jobs):
+        for one in results(work, options.jobs):
             done[one["key"]] = one
             print(json.dumps(one), file=stream, flush=True)
             print(f"{len(done)}: {one['key']}, {one['seconds']} s", file=sys.stderr, flush=True)
     print(text([done[case.key] for case in wanted]))
     return 0
-
-
-def _outcomes(wanted: Sequence[Case], data: Path, jobs: int) -> Iterator[dict[str, Any]]:
-    """Yield outcomes as they come; each case has one thread."""
-    if jobs == 1:
-        numba.set_num_threads(1)
-        for case in wanted:
-            yield measured(case, data)
-        return
-    context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool:
-        for future in as_completed([pool.submit(measured, case, data) for case in wanted]):
-            yield future.result()
 
 
 if __name__ == "__main__":

@@ -10,20 +10,18 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 from typing import Final
-
-import numba
 
 from studies.multiplied.judged import counts, judged, text
 from studies.multiplied.study import AS_IT_IS, DATA, Run, captures, finished, half_of
 from studies.multiplied.ways import WAYS
 from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
+from studies.side_by_side import results
 
 HALVES: Final = ("tuning", "held-out", "both", "none")
 
@@ -53,15 +51,10 @@ def main() -> int:
     path = options.out / "runs.jsonl"
     runs = {(run.capture, run.way): run for run in map(Run.of, map(json.loads, earlier_results(path)))}
     missing = [pair for pair in wanted if pair not in runs]
-    context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
+    work = [partial(finished, options.data, *pair, options.seed) for pair in missing]
     began = time.perf_counter()
-    with (
-        path.open("a") as stream,
-        ProcessPoolExecutor(options.jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool,
-    ):
-        futures = [pool.submit(finished, options.data, *pair, options.seed) for pair in missing]
-        for number, future in enumerate(as_completed(futures), 1):
-            run = future.result()
+    with path.open("a") as stream:
+        for number, run in enumerate(results(work, options.jobs), 1):
             runs[run.capture, run.way] = run
             print(json.dumps(run.values()), file=stream, flush=True)
             print(

@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-import numba
-
 from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
+from studies.side_by_side import results
 from studies.trust.plan import HALVES, SOUND, Half, Plan
 from studies.trust.study import Outcome, outcome
 from studies.trust.tables import counts, text
@@ -60,7 +58,7 @@ def run(half: Half, runs: int, jobs: int, path: Path) -> list[Outcome]:
     done = {one.number: one for one in (Outcome.of(json.loads(line)) for line in lines) if one.number < runs}
     began = time.perf_counter()
     with path.open("a") as stream:
-        for one in _outcomes([Plan(half, number) for number in range(runs) if number not in done], jobs):
+        for one in results([partial(outcome, Plan(half, k)) for k in range(runs) if k not in done], jobs):
             done[one.number] = one
             print(json.dumps(one.values()), file=stream, flush=True)
             ended = f"{'wrong' if one.wrong else 'right'} with {one.status}"
@@ -71,19 +69,6 @@ def run(half: Half, runs: int, jobs: int, path: Path) -> list[Outcome]:
                 flush=True,
             )
     return [done[number] for number in sorted(done)]
-
-
-def _outcomes(plans: Sequence[Plan], jobs: int) -> Iterator[Outcome]:
-    """Yield the outcomes of plans as they come; each run has one thread, to leave the cores to runs side by side."""
-    if jobs == 1:
-        numba.set_num_threads(1)
-        yield from map(outcome, plans)
-        return
-    context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
-    # A function of this module would not be found: workers do not import the `__main__` of a package.
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool:
-        for future in as_completed([pool.submit(outcome, plan) for plan in plans]):
-            yield future.result()
 
 
 if __name__ == "__main__":

@@ -10,18 +10,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-import numba
-
 from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
+from studies.side_by_side import results
 from studies.whole.plan import HALVES, Plan
 from studies.whole.study import Outcome, outcome
 from studies.whole.tables import counts, text
@@ -56,9 +54,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     path = options.out / f"{options.half}.jsonl"
     done = {one.number: one for one in map(Outcome.of, map(json.loads, earlier_results(path)))}
     missing = [plan for plan in plans if plan.number not in done]
+    work = [partial(outcome, options.things, plan) for plan in missing]
     began = time.perf_counter()
     with path.open("a") as stream:
-        for number, one in enumerate(_outcomes(options.things, missing, options.jobs), 1):
+        for number, one in enumerate(results(work, options.jobs), 1):
             done[one.number] = one
             print(json.dumps(one.values()), file=stream, flush=True)
             ended = f"{'right' if one.right else 'wrong'} with {one.status} {' '.join(one.codes)}"
@@ -73,19 +72,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.record:
         record(FOLDER / "whole.json", counts(outcomes))
     return 0
-
-
-def _outcomes(things: Path, plans: Sequence[Plan], jobs: int) -> Iterator[Outcome]:
-    """Yield the outcomes of plans as they come; each run has one thread, to leave the cores to runs side by side."""
-    if jobs == 1:
-        numba.set_num_threads(1)
-        yield from (outcome(things, plan) for plan in plans)
-        return
-    context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
-    # A function of this module would not be found: workers do not import the `__main__` of a package.
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool:
-        for future in as_completed([pool.submit(outcome, things, plan) for plan in plans]):
-            yield future.result()
 
 
 if __name__ == "__main__":
