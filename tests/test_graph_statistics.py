@@ -17,7 +17,7 @@ from modeler import se3
 from modeler.graph import PoseGraph, Smoother, shared_noise, solve, variance_factor
 from modeler.graph.covariance import chi_square_quantile
 from modeler.types import Array, Camera, Edge, Frame, PoseGaussian, RayImage, Solution
-from modeler.verdict.spreads import covariances_about_mean, spread_of_positions, spread_of_rotations
+from modeler.verdict.spreads import AboutMean, spread_of_positions
 from studies.loops import covariances
 
 SEEDS = 120
@@ -184,7 +184,7 @@ def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None
     seen = RayImage(Frame(0, 0.0, np.zeros((1, 1), np.float32), CAMERA), None, 0.0, 0.0, OBJECT_M[None], OBJECT_M[None],
                     np.zeros((1, 2), np.int64))  # fmt: skip
     spreads = [
-        spread_of_positions(dict.fromkeys(TRUTH, seen), solution, covariances_about_mean(solution), 0.005)
+        spread_of_positions(dict.fromkeys(TRUTH, seen), solution, AboutMean.of(solution), 0.005)
         for solution in (alone, shifted)
     ]
     assert spreads[0] is not None
@@ -194,15 +194,18 @@ def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None
 
 
 def test_errors_that_all_poses_share_are_none_of_the_model() -> None:
-    """Along a chain of n steps, ends are known from each other to √n, from the mean to about √(n / 3) of a step."""
+    """Along a chain of 8 steps, ends are known to √8 of a step from each other, to about √(8 / 3) from the mean."""
     motion = PoseGaussian(spin([0.0, 0.3, 0.0]), np.diag(np.repeat([0.01, 0.002], 3) ** 2))
-    solution = solve(PoseGraph(tuple(edge(k - 1, k, motion) for k in range(1, 9))), {})
-    covariances = covariances_about_mean(solution)
+    chain = [edge(k - 1, k, motion) for k in range(1, 9)]
+    found = AboutMean.of(solve(PoseGraph(tuple(chain)), {}))
     for end in (0, 8):
-        np.testing.assert_allclose(covariances[end][:3, :3], 0.01**2 * 8 * 17 / 54 * np.eye(3), atol=1e-9)
-    found = spread_of_rotations(covariances)
-    assert found is not None
-    assert found.frame in (0, 8)
+        covariance = found.covariances[end]
+        np.testing.assert_allclose(covariance[:3, :3], covariance[0, 0] * np.eye(3), atol=1e-9)
+        assert 0.01 * np.sqrt(8 / 4) < np.sqrt(covariance[0, 0]) < 0.01 * np.sqrt(8 / 2.5)
+    lost = edge(8, 9, PoseGaussian(motion.mean, 1e4 * motion.covariance))
+    among = AboutMean.of(solve(PoseGraph((*chain, lost)), {}))
+    assert among.covariances[9][0, 0] > 0.99
+    assert among.covariances[8][0, 0] < 1.1 * found.covariances[8][0, 0]  # one lost pose makes no other one uncertain
 
 
 @pytest.mark.parametrize("share", [0.0, 0.8])
@@ -214,9 +217,10 @@ def test_errors_from_the_mean_of_all_poses_are_calibrated(share: float) -> None:
             k: se3.adjoint(pose) @ se3.log(se3.inverse(pose) @ TRUTH[k]) for k, pose in solution.trajectory.items()
         }
         k = seed % COUNT
-        error = moved[k] - np.mean(list(moved.values()), axis=0)
+        about_mean = AboutMean.of(solution)
+        error = moved[k] - sum(weight * moved[frame] for frame, weight in about_mean.weights.items())
         to_object = se3.adjoint(solution.trajectory[k])
-        covariance = to_object @ covariances_about_mean(solution)[k] @ to_object.T
+        covariance = to_object @ about_mean.covariances[k] @ to_object.T
         values.append(error @ np.linalg.solve(covariance, error))
     assert np.mean(values) == pytest.approx(6.0, abs=TOLERANCE)
 

@@ -50,7 +50,7 @@ from modeler.verdict.evidence import (
     prior_distances,
 )
 from modeler.verdict.spreads import (
-    covariances_about_mean,
+    AboutMean,
     misfit,
     one_axis_sd,
     spread_of_positions,
@@ -367,7 +367,7 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
             poses,
             {frame: away[frame] @ (spread if frame == 2 else ABOUT_OBJECT) @ away[frame].T for frame in poses},
         )
-        spread_from_first = covariances_about_mean(solution)  # no joint covariance is known
+        spread_from_first = AboutMean.of(solution)  # no joint covariance is known
         turn = spread_of_rotations(spread_from_first)
         place = spread_of_positions(views, solution, spread_from_first, 0.005)
         assert turn is not None
@@ -380,8 +380,8 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
     wider = spread_of_rotations(spread_from_first, 2.0)
     assert wider is not None
     assert 1.9 < wider.check.value / turn.check.value < 2.2
-    assert spread_of_rotations(covariances_about_mean(Solution())) is None
-    assert spread_of_positions(views, Solution(), {}, 0.005) is None
+    assert spread_of_rotations(AboutMean.of(Solution())) is None
+    assert spread_of_positions(views, Solution(), AboutMean(), 0.005) is None
 
 
 @pytest.mark.parametrize("sigmas_deg", [(1.5, 0.0, 0.0), (1.5, 0.6, 0.5), (1.3, 1.3, 0.1), (1.0, 1.0, 1.0)])

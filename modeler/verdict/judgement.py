@@ -48,7 +48,7 @@ from modeler.verdict.evidence import (
     prior_distances,
 )
 from modeler.verdict.spreads import (
-    covariances_about_mean,
+    AboutMean,
     misfit,
     size_check,
     spread_of_positions,
@@ -211,12 +211,12 @@ def _colour(step: Step) -> list[_Finding]:
 def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Finding]:
     """Return the uncertainty of the poses of a whole run."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
-    covariances = covariances_about_mean(step.solution)
-    if (turn := spread_of_rotations(covariances, factor)) is not None:
+    about_mean = AboutMean.of(step.solution)
+    if (turn := spread_of_rotations(about_mean, factor)) is not None:
         words = f"the rotation of frame {turn.frame} is uncertain by {turn.check.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.check.limit:.1f}°" if turn.count > 1 else ""
         found.append(_Finding("pose_sd_deg", turn.check, "unsure_rotation", words))
-    if (place := spread_of_positions(step.views, step.solution, covariances, tolerance_m, factor)) is not None:
+    if (place := spread_of_positions(step.views, step.solution, about_mean, tolerance_m, factor)) is not None:
         value_mm, limit_mm = 1000.0 * place.check.value, 1000.0 * place.check.limit
         words = f"the position of frame {place.frame} is uncertain by {value_mm:.1f} mm (one standard deviation)"
         words += f", {place.count - 1} more by over {limit_mm:.1f} mm" if place.count > 1 else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -43,55 +43,52 @@ def misfit(edges: Sequence[Edge], solution: Solution) -> float:
     return 1.0 if fit is None else float(np.sqrt(max(fit.value, 1.0)))
 
 
-def covariances_about_mean(solution: Solution) -> dict[int, Array]:
-    """Return the covariances (6, 6) of poses, in their cameras' coordinates, of errors that all poses do not share.
+@dataclass(frozen=True, eq=False)
+class AboutMean:
+    """Uncertainty of poses from their mean: a motion of all poses together changes nothing of a model."""
 
-    A motion of all poses together changes nothing of a model, so that errors are those from the mean error of frames
-    spread over the run. What is due to the focal length is left out: it is part of the model's size (`size_check`) and
-    of `spread_of_positions`.
+    covariances: Mapping[int, Array] = field(default_factory=dict)
+    """By frame number (6, 6), in its camera's coordinates, without what is due to the focal length: that is part of the
+    model's size (`size_check`) and of `spread_of_positions`."""
+    weights: Mapping[int, float] = field(default_factory=dict)
+    """Weights in the mean of some frames, spread over the run, that sum to 1: one of unknown pose moves it little."""
 
-    Args:
-        solution: the poses; without their joint uncertainty, errors are those relative to the first.
-    """
-    frames = sorted(solution.covariances)
-    if not solution.knows_motions or len(frames) < 2:
-        return {frame: _given_focal_length(solution, frame, None) for frame in frames}
-    some = _spread_over(frames)
-    to_object = {frame: se3.adjoint(solution.trajectory[frame]) for frame in frames}
-    apart = {
-        frame: {
-            other: to_object[frame] @ _given_focal_length(solution, frame, other) @ to_object[frame].T
+    @classmethod
+    def of(cls, solution: Solution) -> AboutMean:
+        """Return the uncertainty of solved poses; without that of motions between any two, relative to the first."""
+        frames = sorted(solution.covariances)
+        if not solution.knows_motions or len(frames) < 2:
+            return cls({k: _given_focal_length(solution, k, None) for k in frames}, dict.fromkeys(frames[:1], 1.0))
+        some = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).astype(np.int64))]
+        to_object = {frame: se3.adjoint(solution.trajectory[frame]) for frame in frames}
+        apart = {
+            (frame, other): to_object[frame] @ _given_focal_length(solution, frame, other) @ to_object[frame].T
+            for frame in frames
             for other in some
             if other != frame
         }
-        for frame in frames
-    }
-    # Of errors x with D(k, j) = cov(x_k - x_j): cov(x_k - x̄) = mean of D(k, j) - half the mean of D(i, j).
-    among = sum((apart[one][other] for one in some for other in apart[one]), np.zeros((6, 6))) / (2.0 * len(some) ** 2)
-    found = {}
-    for frame in frames:
-        of_mean = sum(apart[frame].values(), np.zeros((6, 6))) / len(some) - among
-        from_object = se3.adjoint(se3.inverse(solution.trajectory[frame]))
-        found[frame] = from_object @ of_mean @ from_object.T
-    return found
+        rotations = {k: [np.trace(apart[k, other][:3, :3]) for other in some if other != k] for k in some}
+        precisions = {frame: 1.0 / max(float(np.median(rotations[frame])), 1e-12) for frame in some}
+        weights = {frame: precision / sum(precisions.values()) for frame, precision in precisions.items()}
+        # Of errors x with D(k, j) = cov(x_k - x_j): cov(x_k - x̄) = Σ w_j D(k, j) - ½ Σ w_i w_j D(i, j).
+        to_mean = {frame: np.zeros((6, 6)) for frame in frames}
+        for (frame, other), covariance in apart.items():
+            to_mean[frame] += weights[other] * covariance
+        among = 0.5 * sum((weight * to_mean[frame] for frame, weight in weights.items()), np.zeros((6, 6)))
+        from_object = {frame: se3.adjoint(se3.inverse(solution.trajectory[frame])) for frame in frames}
+        return cls({k: from_object[k] @ (to_mean[k] - among) @ from_object[k].T for k in frames}, weights)
 
 
-def _spread_over(frames: Sequence[int]) -> list[int]:
-    """Return some of sorted frame numbers, spread over the run."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).astype(np.int64))
-    return [frames[k] for k in chosen.tolist()]
-
-
-def spread_of_rotations(covariances: Mapping[int, Array], factor: float = 1.0) -> Spread | None:
+def spread_of_rotations(about_mean: AboutMean, factor: float = 1.0) -> Spread | None:
     """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
 
     Args:
-        covariances: `covariances_about_mean`.
+        about_mean: of the solution.
         factor: on the standard deviations: `misfit`.
     """
     sigmas_deg = {
         frame: float(np.degrees(one_axis_sd(factor**2 * covariance[:3, :3], WRONG_RAD)))
-        for frame, covariance in covariances.items()
+        for frame, covariance in about_mean.covariances.items()
     }
     return _widest(sigmas_deg, float(np.degrees(WRONG_RAD)))
 
@@ -99,7 +96,7 @@ def spread_of_rotations(covariances: Mapping[int, Array], factor: float = 1.0) -
 def spread_of_positions(
     views: Mapping[int, RayImage],
     solution: Solution,
-    covariances: Mapping[int, Array],
+    about_mean: AboutMean,
     tolerance_m: float,
     factor: float = 1.0,
 ) -> Spread | None:
@@ -111,15 +108,15 @@ def spread_of_positions(
     Args:
         views: by frame number; the position is that of a view's centroid.
         solution: the poses.
-        covariances: `covariances_about_mean`.
+        about_mean: of the solution.
         tolerance_m: error of the surface above which a model is wrong.
         factor: on the standard deviations: `misfit`.
     """
     sigmas_m, deformed_m = {}, deformation_by_focal_length(views, solution)
-    for frame, covariance in covariances.items():
+    for frame, covariance in about_mean.covariances.items():
         if frame in views and len(views[frame].points_m):
             of_place = se3.covariance_about(covariance, views[frame].centroid_m)[3:, 3:]
-            of_place = of_place - _of_common_shift(solution, frame)
+            of_place = of_place - _of_common_shift(solution, frame, about_mean.weights)
             given_m = one_axis_sd(factor**2 * of_place, tolerance_m)
             smooth_m = np.sqrt(solution.variance_factor) * views[frame].multipath_m
             sigmas_m[frame] = float(np.linalg.norm([given_m, deformed_m.get(frame, 0.0), smooth_m]))
@@ -172,13 +169,11 @@ def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solutio
     }
 
 
-def _of_common_shift(solution: Solution, frame: int) -> Array:
+def _of_common_shift(solution: Solution, frame: int, weights: Mapping[int, float]) -> Array:
     """Return the covariance (3, 3) in m² of a frame's position due to a shift in all views (method, eq. 8.10)."""
     if solution.common_shift_m2 is None:
         return np.zeros((3, 3))
-    frames = sorted(solution.covariances)
-    others = _spread_over(frames) if solution.knows_motions else frames[:1]
-    mean = np.mean([solution.trajectory[other][:3, :3] for other in others], axis=0)
+    mean = sum((weight * solution.trajectory[k][:3, :3] for k, weight in weights.items()), np.zeros((3, 3)))
     left = np.eye(3) - solution.trajectory[frame][:3, :3].T @ mean
     return np.asarray(left @ solution.common_shift_m2 @ left.T, dtype=np.float64)
 
