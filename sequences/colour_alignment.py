@@ -21,7 +21,7 @@ _EDGE: Final = 0.03  # relative second difference of inverse depth, which is lin
 _LEAST_EDGES: Final = 12.0  # px at that size, mean over the frames
 
 
-Flip = Literal["", "mirrored", "upside down"]
+Flip = Literal["", "mirrored", "upside down", "flipped top to bottom"]
 
 
 @final
@@ -30,7 +30,7 @@ class Misalignment:
     """Where edges of depth are found in colour, if not where they are."""
 
     flip: Flip
-    """Whether colour is mirrored left to right, or upside down."""
+    """Whether colour is mirrored left to right, turned by 180°, or mirrored as OpenGL stores images."""
     scale: tuple[float, float]
     """Size of things in colour relative to depth, across and down."""
     shift_px: tuple[float, float]
@@ -182,13 +182,14 @@ class _Search:
                 (height, width), self._size, (np.fft.fftfreq, np.fft.rfftfreq), strict=True
             )
         )
-        self._phases = {"": 1.0, "mirrored": across, "upside down": down[:, None] * across}
+        rows = down[:, None]
+        self._phases = {"": 1.0, "mirrored": across, "upside down": rows * across, "flipped top to bottom": rows}
 
     def correlations(self, scale: tuple[float, float]) -> dict[Flip, Array]:
         """Return the correlation by shift, down and right, from minus to plus the reach, for each way to flip.
 
         An image turned by 180 degrees has the conjugate spectrum, but for a phase; a mirrored one that of the opposite
-        frequency across.
+        frequency across, or down.
         """
         sums = {flip: np.zeros_like(self._colour[0]) for flip in get_args(Flip)}
         count = 1.0
@@ -196,8 +197,10 @@ class _Search:
             moved = depth if scale == (1.0, 1.0) else _resized(depth, scale)
             spectrum = np.fft.rfft2(moved, self._size)
             sums[""] += np.conj(spectrum) * colour
-            sums["mirrored"] += np.roll(spectrum[::-1], 1, axis=0) * colour
+            opposite = np.roll(spectrum[::-1], 1, axis=0)
+            sums["mirrored"] += opposite * colour
             sums["upside down"] += spectrum * colour
+            sums["flipped top to bottom"] += np.conj(opposite) * colour
             count += float(moved.sum())
         near = np.arange(-self._reach, self._reach + 1)
         found: dict[Flip, Array] = {}

@@ -220,10 +220,11 @@ def test_images_packed_by_rvl_are_read(frames: list[Frame], rng: np.random.Gener
         from_rvl(b"", "bag")
 
 
-def test_colour_upside_down_is_reported(tmp_path: Path) -> None:
-    found = cards(tmp_path / "s", upside_down=True)
+@pytest.mark.parametrize(("mirrored", "flip"), [(False, "upside down"), (True, "flipped top to bottom")])
+def test_colour_upside_down_is_reported(tmp_path: Path, *, mirrored: bool, flip: str) -> None:
+    found = cards(tmp_path / "s", upside_down=True, mirrored=mirrored)
     assert found.misaligned is not None
-    assert found.misaligned.flip == "upside down"
+    assert found.misaligned.flip == flip
     assert found.misaligned.is_sure
 
 
