@@ -18,7 +18,7 @@ from studies.formats.image_folders import small_frames
 
 pytest.importorskip("nicegui", reason="needs the extra studio")
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs Playwright")
-pytestmark = needs_browser
+pytestmark = [needs_browser, pytest.mark.slow]
 CAPTURES = Path(__file__).parents[1].parent / "shared" / "data"
 PATIENCE_MS = 90_000
 STEPS = ("Files", "Capture", "Object", "Build", "Check", "Take away", "Scans")
@@ -54,9 +54,9 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of five small frames of the bundled box."""
+    """Return a folder of three small frames of the bundled box."""
     folder = tmp_path_factory.mktemp("capture") / "box"
-    write_bop(folder, small_frames(5), depth_scale_mm=1.0)
+    write_bop(folder, small_frames(3), depth_scale_mm=1.0)
     return folder
 
 
@@ -127,8 +127,8 @@ def test_a_capture_becomes_an_exported_model_which_a_second_page_shows_too(
 ) -> None:
     with served(capture, tmp_path / "studio") as server:
         window, other = Window(browser, server), Window(browser, server, (390, 844))
-        window.sees("5 frames.")
-        assert window.page.locator(".strip img").count() >= 5
+        window.sees("3 frames.")
+        assert window.page.locator(".strip img").count() >= 3
         assert window.fits()
         assert other.fits()
         window.click("button", "Next: build")
@@ -144,7 +144,7 @@ def test_a_capture_becomes_an_exported_model_which_a_second_page_shows_too(
         size = download.value.path().stat().st_size
         assert size == (tmp_path / "studio" / "box" / "take-away" / "box.stl").stat().st_size > 1000
         report = RunFolder(tmp_path / "studio" / "box" / "run-1").report()
-        assert len(report["poses"]) == 5
+        assert len(report["poses"]) == 3
         for number, step in enumerate(STEPS, start=1):
             window.page.keyboard.press(str(number))
             window.page.locator("[role=tab][aria-selected=true]", has_text=step).wait_for()
@@ -171,14 +171,13 @@ def answered_ms(page: Any) -> float:
     return float(page.evaluate(script, [["Files", 0], ["Build", 3]]))
 
 
-@pytest.mark.slow
 def test_what_was_painted_and_chosen_survives_a_server_that_is_killed(
     browser: Any, capture: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "studio"
     with served(capture, out) as server:
         window = Window(browser, server)
-        window.sees("5 frames.")
+        window.sees("3 frames.")
         window.page.keyboard.press("ArrowRight")
         window.click("button", "Add")
         window.drag((10.0, 10.0), (40.0, 12.0))
@@ -205,7 +204,6 @@ def test_what_was_painted_and_chosen_survives_a_server_that_is_killed(
             end(record["pid"])
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.skipif(not (CAPTURES / "cap").exists(), reason="the captures are not here")
 def test_a_wrong_mask_of_the_cap_is_mended_by_one_box_and_frames_are_dropped_and_put_back(
