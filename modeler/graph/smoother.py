@@ -233,7 +233,6 @@ def solve(
     graph: PoseGraph,
     guess: Mapping[int, Array],
     *,
-    outlier_distance: float = Smoother.outlier_distance,
     shared: float = 0.0,
     common: float = 0.0,
     axis: CommonAxis | None = None,
@@ -249,7 +248,6 @@ def solve(
     Args:
         graph: the edges.
         guess: initial object_from_camera (4, 4) by frame number; for other frames, dead reckoning.
-        outlier_distance: see `Smoother`.
         shared: see `Smoother`.
         common: see `Smoother`.
         axis: the turntable, if any.
@@ -259,5 +257,5 @@ def solve(
     Raises:
         ValueError: if an accepted edge's covariance is not positive definite.
     """
-    parts = outlier_distance, shared, common, axis, focal, common_shift_m2
+    parts = Smoother.outlier_distance, shared, common, axis, focal, common_shift_m2
     return Smoother(*parts, solution=Solution(guess)).to(graph).solution

@@ -104,6 +104,9 @@ def _packed(array: npt.NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
+_FIELD_OF_VIEW_DEG: Final = 30.0  # vertical
+
+
 def shade(
     vertices_m: Array,
     triangles: npt.NDArray[np.int64],
@@ -111,7 +114,6 @@ def shade(
     object_from_camera: Array,
     size: tuple[int, int],
     *,
-    field_of_view_deg: float = 30.0,
     samples: int = 2,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (h, w, 3) of a mesh under a light next to the camera, on white; back sides are drawn red.
@@ -122,7 +124,6 @@ def shade(
         colours: (v, 3) RGB; None = grey.
         object_from_camera: (4, 4) pose of the camera (x right, y down, z forward) in the mesh's frame.
         size: height and width in px.
-        field_of_view_deg: vertical.
         samples: rays along each side of a pixel.
     """
     import open3d as o3d  # slow to import, and nothing else of viz needs it
@@ -133,7 +134,7 @@ def shade(
         o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
     )
     height, width = size[0] * samples, size[1] * samples
-    focal = 0.5 * height / np.tan(np.radians(0.5 * field_of_view_deg))
+    focal = 0.5 * height / np.tan(np.radians(0.5 * _FIELD_OF_VIEW_DEG))
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
     along = np.stack(
         [(columns - 0.5 * (width - 1)) / focal, (rows - 0.5 * (height - 1)) / focal, np.ones((height, width))], axis=-1
