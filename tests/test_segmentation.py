@@ -258,6 +258,35 @@ def test_a_near_object_that_fills_half_of_the_image_is_not_taken_for_a_moving_ca
         assert iou(segmenter.segment(frame, scene).mask, mask) > 0.9
 
 
+def test_an_object_that_the_image_cuts_off_in_all_frames_is_found_as_far_as_it_is_seen(rng):
+    """Its own sides at the image's edge are no walls, nor is it an arm that something else would be left without."""
+    frames, masks = [], []
+    for k in range(8):
+        world = World(distance_m=0.42).table()
+        frame, mask = world.box((0.0, 0.0, 0.1), (0.12, 0.07, 0.1), turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
+        frames.append(frame)
+        masks.append(mask)
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert not scene.arms
+    for frame, mask in zip(frames, masks, strict=True):
+        found = segmenter.segment(frame, scene)
+        assert iou(found.mask, mask) > 0.9
+        assert found.outcome is Outcome.CUT_OFF
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_wall_close_behind_a_hanging_object_is_not_its_support(rng, masked):
+    frames = []
+    for k in range(8):
+        world = World().box((0.0, 0.2, 0.0), (2.0, 0.01, 2.0))
+        frame, mask = world.box((0.0, 0.0, 0.0), (0.12, 0.07, 0.07), turn_deg=20.0 * k, label=OBJECT).frame(k, rng)
+        frames.append(replace(frame, mask=mask) if masked else frame)
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert all(segmenter.segment(frame, scene).plane is None for frame in frames)
+
+
 def test_the_middle_of_a_hanging_object_that_turns_slowly_is_part_of_it(rng):
     """Depth changes there by less than its noise, and nothing carries the object."""
     frames, masks = [], []

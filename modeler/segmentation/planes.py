@@ -31,6 +31,7 @@ _LEVEL = np.cos(np.radians(2.0))
 _LEVEL_BONUS = 1.5  # factor on the votes for level planes
 _PARALLEL = np.cos(np.radians(6.0))  # between the normals of parallel planes, given the accuracy of small ones
 _ABOVE_SHARE = 0.98  # share of an object above its support
+_TOUCHING_SHARE = 0.1  # share of an object's size: 0.04 to 0.06 are left above a support, 0.2 before a near wall
 _REACH_SIZES = 1.5  # radius of an object's surroundings, in sizes of the object
 _MAX_GROUND = 6000  # points; more do not help, since their errors are correlated
 
@@ -217,7 +218,8 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
 
     That is the highest plane with almost all of the object above it that is seen near the object and not far below it.
     Planes parallel to the first that faces up in the image go before others that face up, and those before the rest: a
-    carton does not stand on the wall behind it.
+    carton does not stand on the wall behind it. Planes that face down, as those walls do that a camera above sees, hold
+    only what reaches them: the camera may hang upside down.
 
     Args:
         planes: (k, 4) normals and offsets, largest first.
@@ -241,7 +243,9 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
     for plane, grade in zip(planes, rank, strict=True):
         height = heights(body, plane)
         seen = np.count_nonzero(np.abs(heights(ground, plane)) < np.median(tolerance))
-        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and np.percentile(height, 5) < 0.5 * size
+        lowest, low = np.percentile(height, [1, 5])
+        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and low < 0.5 * size
+        holds &= lowest < _TOUCHING_SHARE * size or plane[1] < _UPRIGHT
         merit = (int(grade), -float(np.median(height)))
         if seen >= _MIN_POINTS and holds and merit > best:
             best, found = merit, plane

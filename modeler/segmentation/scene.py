@@ -191,10 +191,10 @@ def _standing_object(
     levels = levels[parallel(levels, levels[0])]
     tolerance = noise.tolerance_m(depth)
     free = allowed.copy()
-    rim = _rim(points)
-    for plane in planes[~facing] if facing.any() else planes[1:]:
-        if _beyond_image(plane, rim, noise):
-            free &= ~(np.abs(heights(points, plane)) < tolerance)
+    walls = _beyond_image(planes, points[edge_of(np.isfinite(depth))], noise)
+    walls &= ~facing if facing.any() else np.arange(len(planes)) > 0
+    for plane in planes[walls]:
+        free &= ~(np.abs(heights(points, plane)) < tolerance)
     for level in levels[np.argsort(-levels[:, 3])]:
         labels = pieces(depth, free & (heights(points, level) > tolerance))
         merit = _central(labels, depth, np.ones_like(depth))
@@ -214,28 +214,29 @@ def _central(labels: Labels, depth_m: Float32Array, weight: Float32Array) -> npt
     return merit.astype(np.float64)
 
 
-def _rim(points: Float32Array) -> Float32Array:
-    """Return the points (n, 3) of an image (h, w, 3) at the edge of the field of view."""
-    return points[edge_of(np.isfinite(points[..., 2]))]
+def _beyond_image(planes: Array, rim: Float32Array, noise: DepthNoise) -> BoolArray:
+    """Return which planes (k, 4), largest first, extend beyond the image, on whose rim the static points (n, 3) are.
 
-
-def _beyond_image(plane: Array, rim: Float32Array, noise: DepthNoise) -> bool:
-    """Return whether a plane (4,) extends beyond the image, on whose rim the points (n, 3) are."""
-    on = np.abs(heights(rim, plane)) < noise.tolerance_m(rim[:, 2])
-    return bool(np.count_nonzero(on) > _WALL_BORDER_SHARE * len(rim))
+    A point is on one plane, the largest: a small one would else have all those at which it cuts others.
+    """
+    tolerance_m, free, beyond = noise.tolerance_m(rim[:, 2]), np.ones(len(rim), dtype=np.bool_), []
+    for plane in planes:
+        on = free & (np.abs(heights(rim, plane)) < tolerance_m)
+        beyond.append(np.count_nonzero(on) > _WALL_BORDER_SHARE * len(rim))
+        free &= ~on | (not beyond[-1])
+    return np.array(beyond, dtype=np.bool_)
 
 
 def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | None, noise: DepthNoise) -> Float32Array:
     """Return the depth (h, w) at and beyond which there is no object, infinite where unknown.
 
     A static piece above the support that lies within the image may belong to the object: the middle of a mug on a
-    turntable looks static, and only its handle moves. Without a support, nothing static is the object. Nor are walls
-    behind all that moves: planes that extend beyond the image, or are larger next to the object than behind it. They
-    continue behind the object.
+    turntable looks static, and only its handle moves. Walls do not, planes behind all that moves that extend beyond the
+    image, or are larger next to the object than behind it. They continue behind the object.
     """
     back = layers.back_m[..., 2]
-    body, rim = layers.front_m[found], _rim(layers.back_m)
-    tolerance_m, body_tolerance_m = noise.tolerance_m(back), noise.tolerance_m(body[:, 2])
+    tolerance_m, rim = noise.tolerance_m(back), layers.back_m[edge_of(np.isfinite(back)) & layers.still]
+    body, body_tolerance_m = layers.front_m[found], noise.tolerance_m(layers.front_m[found][:, 2])
     above, around = layers.still & ~found, layers.still & ~outline(found)
     if support is not None:
         over_m = heights(layers.back_m, support)
@@ -243,17 +244,16 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
         around &= np.abs(over_m) > tolerance_m
         rim[np.abs(heights(rim, support)) < noise.tolerance_m(rim[:, 2])] = np.nan
     labels = pieces(back, above)
-    touching = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1)
-    outside = touching >= _TOUCHING_PX
+    outside = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1) >= _TOUCHING_PX
     outside[0] = False
     depth = np.where(outside[labels], back, np.float32(np.inf))
-    for plane in planes:
+    for plane, goes_on in zip(planes, _beyond_image(planes, rim, noise), strict=True):
         level = support is not None and bool(parallel(plane[None], support)[0])  # the support, or the top of a box
         if level or np.mean(heights(body, plane) > -body_tolerance_m) < _IN_FRONT_SHARE:
             continue
         in_front_m = heights(layers.back_m, plane)
         on = around & (np.abs(in_front_m) < tolerance_m)
-        if np.count_nonzero(on) < np.count_nonzero(found) and not _beyond_image(plane, rim, noise):
+        if np.count_nonzero(on) < np.count_nonzero(found) and not goes_on:
             continue
         facing = layers.rays @ plane[:3].astype(np.float32)
         behind = np.float32(plane[3]) / np.maximum(-facing, np.float32(1e-6))

@@ -86,8 +86,10 @@ class Segmenter:
         # A second pass: whole masks determine zone and visible area better than the moving pixels.
         looks, whole = self._looks(shown, scene)
         if not whole and looks:
-            scene = replace(scene, arms=True)
-            looks, whole = self._looks(shown, scene)
+            without_arms = replace(scene, arms=True)
+            freed, whole = self._looks(shown, without_arms)
+            if whole:
+                scene, looks = without_arms, freed
         if not looks:
             return scene
         looks = whole or looks
@@ -101,7 +103,6 @@ class Segmenter:
         return replace(
             scene,
             nearest_m=nearest_seen_m(frames, masks) if whole else None,
-            arms=scene.arms and bool(whole),
             zone_m=zone,
             areas_m2=(min(areas), max(areas)),
             sure=sure,
