@@ -275,6 +275,18 @@ def test_an_object_that_the_image_cuts_off_in_all_frames_is_found_as_far_as_it_i
         assert found.outcome is Outcome.CUT_OFF
 
 
+@pytest.mark.parametrize("table", [False, True])
+def test_masks_are_asked_for_where_an_arm_may_be_part_of_the_object(rng, table):
+    frames = []
+    for k in range(8):
+        world = World().table() if table else World().box((0.0, 0.6, 0.0), (2.0, 0.01, 2.0))
+        world.box((0.0, 0.0, 0.14), (0.06, 0.04, 0.07), turn_deg=25.0 * k, label=OBJECT)
+        arm = world.box((0.27, 0.0, 0.14 + 0.01 * (k % 3)), (0.25, 0.03, 0.03))
+        frames.append(arm.frame(k, rng)[0])
+    doubts = Segmenter().scene(frames).doubts
+    assert any("give masks if a hand holds it" in doubt for doubt in doubts) is not table
+
+
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_wall_close_behind_a_hanging_object_is_not_its_support(rng, masked):
     frames = []

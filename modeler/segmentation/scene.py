@@ -71,6 +71,8 @@ class Scene:
     """(h, w), downsampled: the edge of the field of view, where objects may be truncated."""
     arms: bool = False
     """Whether arms that touch the object are in most frames."""
+    leads_out: bool = False
+    """Whether the object leads out of view in most frames: the image cuts it off, or an arm is taken for part of it."""
     areas_m2: tuple[float, float] | None = None
     """Least and greatest area that the object showed to the camera."""
     sure: bool = True
@@ -91,12 +93,14 @@ class Scene:
     @property
     def doubts(self) -> tuple[str, ...]:
         """What may be wrong with the capture, in words."""
-        if not self.camera_moves:
-            return ()
-        return (
-            "the camera seems to move: what stands at the middle of each image is taken for the object; give masks, "
-            "`roi` or `max_depth_m` where that is something else",
-        )
+        if self.camera_moves:
+            return (
+                "the camera seems to move: what stands at the middle of each image is taken for the object; "
+                "give masks, `roi` or `max_depth_m` where that is something else",
+            )
+        if self.leads_out and self.plane is None:
+            return ("what moves leads out of the image, and nothing carries it: give masks if a hand holds it",)
+        return ()
 
 
 def scene_frames(indices: Sequence[int], before: Sequence[int] = (), *, count: int = 15) -> tuple[int, ...]:

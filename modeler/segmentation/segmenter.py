@@ -103,6 +103,7 @@ class Segmenter:
         return replace(
             scene,
             nearest_m=nearest_seen_m(frames, masks) if whole else None,
+            leads_out=not whole,
             zone_m=zone,
             areas_m2=(min(areas), max(areas)),
             sure=sure,
