@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import weakref
 from dataclasses import dataclass
 from functools import cached_property
@@ -190,6 +191,23 @@ def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
     return KinectSequence(path, lens, pairs, tuple(left), file, alignment, unit_mm, by_maker)
 
 
+_HOLE_BYTES = 1 << 30  # which the library reads in a second
+"""Largest hole of a file: zeros that were never written."""
+
+
+def _check_whole(path: Path) -> None:
+    """Reject a file whose end was never written, as after a disk was full: the library would look for images in it.
+
+    Raises:
+        InputError: if it is such.
+    """
+    with open(path, "rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        hole_bytes = size - os.lseek(file.fileno(), 0, getattr(os, "SEEK_HOLE", os.SEEK_END)) if size else 0
+    if hole_bytes > _HOLE_BYTES:
+        raise InputError(f"{path}: ends in {hole_bytes / 1e9:.0f} GB that were never written; record or copy it again.")
+
+
 @final
 @dataclass(frozen=True)
 class Matroska:
@@ -272,6 +290,7 @@ class Matroska:
         except ImportError:
             raise InputError(f"{self.path}: recordings of the Azure Kinect are read by PyAV; {ADVICE}") from None
         check_regular(self.path)
+        _check_whole(self.path)
         container = av.open(str(self.path), mode="r")
         weakref.finalize(self, container.close)
         return container
