@@ -135,6 +135,11 @@ def test_a_loop_that_is_open_leads_to_the_focal_length() -> None:
     (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith("modeler calibrate-camera")
     assert found.parameters == {"camera": "camera.json"}
+    for factor, again in ((0.97, True), (0.995, False)):  # known to 1 %: the second was estimated before
+        report["camera"] = {"loops": 3, "factor_in_run": factor, "focal_factor_sigma": 0.01}
+        (found,) = remedies(report, priors.GeneralPrior())
+        assert found.first.startswith("modeler calibrate-camera") is again
+        assert bool(found.parameters) is again
 
 
 @pytest.mark.parametrize(("sds", "said"), [(2.9, False), (3.3, True)])

@@ -273,9 +273,15 @@ def _surface(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
 
 
 def _camera(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy | None:
-    """Return how to estimate the focal length, if a loop determines it."""
+    """Return how to estimate the focal length, if a loop determines it; not again if it is that used."""
     if not any(edge["kind"] in ("closure", "join") for edge in report["edges"]):
         return _more_known(report, prior)
+    camera = report.get("camera") or {}
+    if camera.get("loops") and abs(np.log(camera["factor_in_run"])) <= camera["focal_factor_sigma"]:
+        return Remedy(
+            "the focal length that closes the loop is the one given: these images tell no more; record again in "
+            "smaller steps and with more of the image on the object"
+        )
     first = "modeler calibrate-camera {run} `out` camera.json"
     return Remedy("estimate the focal length from the loop, and build with it", {"camera": "camera.json"}, first)
 
