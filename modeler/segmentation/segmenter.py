@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
+from scipy import ndimage
 
 from modeler.segmentation.background_colour import BackgroundColour, without_background
 from modeler.segmentation.depth_images import (
@@ -127,6 +128,9 @@ class Segmenter:
             share = 0.0 if plane is None else self._share_on(plane, frame, mask, scene.range_noise)
             if plane is not None and _LOOSE_SHARE < share <= 0.5:
                 mask = mask & ~self._on(plane, frame, scene.range_noise)
+                # Of the support, noise leaves specks near it.
+                near = self._on(plane, frame, scene.range_noise, reach=2.0)
+                mask = mask & (~near | ndimage.binary_opening(mask, iterations=2))
             stride = planning_stride(frame.camera)
             cut = is_cut(mask, edge_of(np.isfinite(_measured(frame)[::stride, ::stride])))
             outcome = Outcome.UNSURE_MASK if share > 0.5 else Outcome.CUT_OFF if cut else Outcome.CONVERGED
@@ -214,11 +218,13 @@ class Segmenter:
         measured = mask[::stride, ::stride] & (frame.depth_m[::stride, ::stride] > 0.0)
         return float(np.mean(self._on(plane, frame, seen, stride)[measured]))
 
-    def _on(self, plane: Plane, frame: Frame, seen: RangeNoise | None, stride: int = 1) -> BoolArray:
-        """Return which pixels of a downsampled frame lie on the support plane, by the noise that planes show."""
+    def _on(
+        self, plane: Plane, frame: Frame, seen: RangeNoise | None, stride: int = 1, reach: float = 1.0
+    ) -> BoolArray:
+        """Return which pixels of a downsampled frame lie on the support plane, by `reach` times the noise of planes."""
         noise = self.noise if seen is None else DepthNoise(0.0, seen.pixel_sigma_inverse_per_m)
         points = _points(frame, stride).astype(np.float64)
-        return np.asarray(np.abs(plane.height_m(points)) < noise.tolerance_m(points[..., 2]))
+        return np.asarray(np.abs(plane.height_m(points)) < reach * noise.tolerance_m(points[..., 2]))
 
     def _plane_beside(self, frame: Frame, mask: BoolArray) -> Plane | None:
         """Return the support plane around a masked object, if one is seen."""
