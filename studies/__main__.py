@@ -31,7 +31,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "growing": ("draw a model that grows, with the uncertainty of its poses", "a minute"),
     "hostile": ("commands in hostile environments: no traceback, no hang, nothing left behind", "two hours"),
     "in_hand": ("whole models of objects in a hand", "half an hour"),
-    "inputs": ("models of inputs as people have them, right and wrong, drawn at random", "an hour a core"),
+    "inputs": ("models of inputs as people have them, right and wrong, drawn at random", "half an hour a core"),
     "kills": ("commands that are killed and given again end with the same bytes", "16 minutes"),
     "live": ("following an object before a camera of 30 Hz in real time", "minutes"),
     "loops": ("trajectory errors before and after loop closure", "half an hour"),

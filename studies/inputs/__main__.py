@@ -33,7 +33,7 @@ from studies.results.tables import FOLDER, markdown, record
 from studies.results_file import earlier_results
 
 HALVES: Final = ("tuning", "held-out")
-EACH: Final = 4
+EACH: Final = 2
 """Runs of a way in a half."""
 ENDS: Final = ("right", "named", "unnamed", "wrong with 0")
 """How a run ends: a right model with 0; refused or not trusted, with the cause named; the same without; else."""

@@ -38,6 +38,8 @@ def run(log: Path, change: int, arguments: list[str]) -> int:
         made = event == "open" and isinstance(values[2], int) and values[2] & _MAKING
         if not made and event not in ("os.rename", "os.remove", "os.mkdir", "os.rmdir"):
             return
+        if isinstance(values[0], int):  # a pipe that is open
+            return
         if not os.path.abspath(os.fsdecode(values[0])).startswith(folder):
             return
         changes += 1
