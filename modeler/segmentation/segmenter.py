@@ -116,9 +116,9 @@ class Segmenter:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
         A frame's own mask is kept, within region and largest depth; it is CUT_OFF if it goes on beyond the image. If it
-        covers much of the support, what noise does not tell from that is left out, or, if that is most of it, the mask
-        is UNSURE_MASK. For sparse measurements, the mask includes the gaps between those of the object. An object of
-        which its own mask leaves the rim out is modelled as far as it is seen.
+        covers much of the support it is UNSURE_MASK, as its rim may lie on more than that; what noise does not tell
+        from the support is left out, unless it is most of the mask. For sparse measurements, the mask includes the gaps
+        between those of the object. Where its own mask leaves the rim out, an object is modelled as far as it is seen.
         """
         frame = _interpolated(frame)
         if frame.mask is not None:
@@ -130,10 +130,10 @@ class Segmenter:
                 mask = mask & ~self._on(plane, frame, scene.range_noise)
                 # Of the support, noise leaves specks near it.
                 near = self._on(plane, frame, scene.range_noise, reach=2.0)
-                mask = mask & (~near | ndimage.binary_opening(mask, iterations=2))
+                mask = mask & (~near | np.asarray(ndimage.binary_opening(mask, iterations=2), dtype=np.bool_))
             stride = planning_stride(frame.camera)
             cut = is_cut(mask, edge_of(np.isfinite(_measured(frame)[::stride, ::stride])))
-            outcome = Outcome.UNSURE_MASK if share > 0.5 else Outcome.CUT_OFF if cut else Outcome.CONVERGED
+            outcome = Outcome.UNSURE_MASK if share > _LOOSE_SHARE else Outcome.CUT_OFF if cut else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
