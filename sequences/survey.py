@@ -31,8 +31,9 @@ OFF_MIDDLE = 0.1
 exchanged."""
 FAR_OFF_MIDDLE = 0.3
 """Beyond such a share no camera has it, but intrinsics of larger images do."""
-MUCH_NEARER = 0.25
-"""If exchanging cx and cy brings it nearer to the middle by this factor, they are exchanged."""
+IN_MIDDLE = 0.04
+"""Within such a share calibrated cameras have it. Cut-out images may have it anywhere: only there, once exchanged or
+scaled to the images, is an error plain."""
 USUAL_FIELD_DEG = (1.0, 135.0)
 """Fields of view of depth cameras, crops included."""
 WIDEST_FIELD_DEG = 170.0
@@ -315,12 +316,14 @@ def _on_principal_point(camera: Camera) -> list[tuple[str, bool]]:
     exchanged, far = swapped_px < off_px and off_px > OFF_MIDDLE * longer_px, off_px > FAR_OFF_MIDDLE * longer_px
     if not (exchanged or far):
         return []
+    across, down = 2.0 * camera.cx / camera.width, 2.0 * camera.cy / camera.height
+    scaled = across > 0.0 < down and max(across, down) < (1.0 + IN_MIDDLE) * min(across, down)
     question = "cx and cy exchanged" if exchanged else "the intrinsics those of images of another size"
     words = (
         f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies {off_px:.0f} px off the middle of the images: "
         f"are {question}? Correct them, or give `intrinsics`"
     )
-    return [(words, far or swapped_px < MUCH_NEARER * off_px)]
+    return [(words, swapped_px < IN_MIDDLE * longer_px if exchanged else scaled)]
 
 
 def _on_unit(middle_m: float) -> str:

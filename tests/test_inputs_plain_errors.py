@@ -172,6 +172,18 @@ def test_units_and_principal_points_that_are_plainly_wrong_are_refused(
     assert not survey(open_sequence(folder, given)).plain_errors
 
 
+def test_images_cut_out_anywhere_are_doubted_at_most(tmp_path: Path, frames: list[Frame]) -> None:
+    camera = frames[0].camera
+    for frame in frames:
+        save(tmp_path / "depth" / f"{frame.index}.png", raw_depth(frame, 1.0))
+    for cx, cy in ((-0.2, 0.7), (1.4, 0.5), (0.5, -0.3), (1.2, 1.0)):
+        facts = {"fx": camera.fx, "fy": camera.fy, "cx": cx * camera.width, "cy": cy * camera.height}
+        (tmp_path / "camera.json").write_text(json.dumps({**facts, "depth_scale": 1.0}))
+        found = survey(open_sequence(tmp_path))
+        assert "principal point" in " ".join(found.doubts)
+        assert not found.plain_errors
+
+
 def packed(image: np.ndarray) -> bytes:
     """Pack depth by RVL, number by number, as Wilson's program does."""
     values, groups, at, before = image.ravel().astype(int).tolist(), [], 0, 0
