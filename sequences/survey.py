@@ -20,10 +20,10 @@ FARTHEST_M = 100.0
 
 
 PLAUSIBLE_M = (0.1, 5.0)
-"""Beyond these it is refused, unless the unit is given as an option: cameras for close range measure from 0.07 m, and
+"""Beyond these it is refused, unless the unit is sure: cameras for close range measure from 0.07 m, and
 objects farther than 5 m are not turned."""
-GIVEN_UNIT = "`depth_scale_mm`"
-"""What the source of a unit says that is given as an option; of a program's own arrays, in m, it says nothing."""
+SURE_UNITS = ("`depth_scale_mm`", "of the format", "(the camera)", "(/", "(16UC1)", "(32FC1)")
+"""What the sources of units say that nobody mistypes: an option, a format, a camera, topics and encodings of bags."""
 LIKELY_M = (0.25, 5.0)
 """Half of a camera's depth lies within these limits when it watches an object; elsewhere the unit may be wrong."""
 OFF_MIDDLE = 0.1
@@ -118,7 +118,8 @@ class Survey:
         """What depth or colour plainly are not, in words."""
         axis, ray = self.flat
         found = [words for camera in self.cameras[:1] for words, sure in _on_principal_point(camera) if sure]
-        if not PLAUSIBLE_M[0] <= self.range_m[1] <= PLAUSIBLE_M[1] and GIVEN_UNIT not in self.unit and self.unit != "m":
+        unit_is_sure = self.unit == "m" or any(source in self.unit for source in SURE_UNITS)
+        if not (unit_is_sure or PLAUSIBLE_M[0] <= self.range_m[1] <= PLAUSIBLE_M[1]):
             found.append(_on_unit(self.range_m[1]))
         if ray > max(LEAST_FLAT, BENT * axis):
             found.append(
