@@ -124,7 +124,7 @@ def test_what_may_be_meant_otherwise_is_asked(tmp_path: Path, frames: list[Frame
     swapped = [replace(one, camera=camera) for one, camera in zip(frames, cameras, strict=True)]
     write_bop(tmp_path / "swapped", swapped, depth_scale_mm=1.0)
     (doubt,) = survey(open_sequence(tmp_path / "swapped")).doubts
-    assert doubt.endswith("are cx and cy exchanged?")
+    assert "are cx and cy exchanged?" in doubt
     larger = [replace(one.camera, cx=2.0 * one.camera.cx, cy=2.0 * one.camera.cy) for one in frames]
     doubled = [replace(one, camera=camera) for one, camera in zip(frames, larger, strict=True)]
     write_bop(tmp_path / "larger", doubled, depth_scale_mm=1.0)

@@ -48,7 +48,9 @@ def toy(tmp_path: Path) -> Path:
 def called(toy: Path, **settings: str) -> list[str]:
     """Return the result in a process of its own, the number of events of compiling, and the state of the cache."""
     places = {"HOME": str(toy / "home"), "TMPDIR": str(toy / "temporary")}
-    environment = {**os.environ, "PYTHONPATH": str(toy), **places, **settings}
+    # Sources of equal times and sizes are equal to Python itself, where it has written bytecode.
+    python = {"PYTHONPATH": str(toy), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {**os.environ, **python, **places, **settings}
     ended = subprocess.run(
         [sys.executable, "-c", _CALL], env=environment, capture_output=True, text=True, check=False, timeout=100.0
     )

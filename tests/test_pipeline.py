@@ -406,7 +406,7 @@ def test_same_seed_same_bits_side_by_side_or_one_after_the_other(monkeypatch: py
 def test_the_prior_learns_from_all_that_came_before_a_frame() -> None:
     prior = AnyPrior()
     steps = run(FRAMES[:4], prior=prior)
-    assert prior.lessons == [([0], 0), ([0, 1], 1), ([0, 1, 2], 2)]
+    assert prior.lessons == [([0], 0), ([0, 1], 1), ([0, 1, 2], 2), ([0, 1, 2, 3], 3)]  # the last before further pairs
     assert len(steps[-1].edges_so_far) == 3
 
 
