@@ -20,7 +20,7 @@ FARTHEST_M = 100.0
 
 
 PLAUSIBLE_M = (0.1, 5.0)
-"""Beyond these it is refused, unless the unit is sure: cameras for close range measure from 0.07 m, and
+"""Beyond these the median depth is refused, unless its unit is sure: cameras for close range measure from 0.07 m, and
 objects farther than 5 m are not turned."""
 SURE_UNITS = ("`depth_scale_mm`", "of the format", "(the camera)", "(/", "(16UC1)", "(32FC1)")
 """What the sources of units say that nobody mistypes: an option, a format, a camera, topics and encodings of bags."""
@@ -30,7 +30,7 @@ OFF_MIDDLE = 0.1
 """Principal points lie within such a share of an image's longer side of its middle; farther off, cx and cy may be
 exchanged."""
 FAR_OFF_MIDDLE = 0.3
-"""Beyond such a share no camera has it, but intrinsics of larger images do."""
+"""Beyond such a share no whole image has it, but cut-out ones and intrinsics of larger images do."""
 IN_MIDDLE = 0.04
 """Within such a share calibrated cameras have it. Cut-out images may have it anywhere: only there, once exchanged or
 scaled to the images, is an error plain."""

@@ -16,8 +16,8 @@ _MIN_PAIRS, _MAX_PAIRS = 3, 60  # of many, the latest suffice
 MIN_TURN_RAD = np.radians(5.0)  # below, a turn says little of its axis
 _FREEDOM = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
 _ITERATIONS = 30
-UNDECIDED = 1.0 / 500.0
-"""Probability of the opposite sense below which the sense counts as known: three certain pairs leave 9⁻³."""
+UNDECIDED = 1.0 / 500.0  # by three certain pairs it is 9⁻³ = 1 / 729
+"""Probability of the opposite sense below which the sense counts as known, and which it then has."""
 _MAX_LOG_ODDS = np.log(9.0)  # bound on the log odds of one pair, which may have missed the true mode
 
 

@@ -17,8 +17,8 @@ from modeler.verdict.evidence import TOLERANCE
 _MIDDLE: Final = 0.25  # of the image on each side is not its middle
 _HOLES: Final = 1e-3  # of all pixels: ten recordings of whole scenes lack 0.01 to 0.3 of them
 _STEP: Final = 0.1  # of the distance: less is one surface, seen at a slant
-_GHOST_POINTS: Final = 3000  # of each view, some pixels apart, which the next number closes
-_GHOST_PX: Final = 3
+_GHOST_POINTS: Final = 3000  # of each view: of an object of 300 x 300 px, one in 30 pixels
+_GHOST_PX: Final = 3  # closes gaps of 6 px between them, and clears specks as wide
 _OUTER: Final = (2, 98)  # percentiles between which the object lies; pixels at its edges may lie anywhere
 _TURN: Final = re.compile(r"turn by (\d+)°")
 
