@@ -242,13 +242,18 @@ def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rn
     judge(half_round, [mask[::-1, ::-1] for mask in masks], least=0.9)
 
 
+def turned_box(distance_m, half_m, rng):
+    """Return eight frames of a box on a table, turned by 25° from each to the next, and its masks (h, w)."""
+    worlds = [World(distance_m=distance_m).table() for _ in range(8)]
+    views = [
+        world.box((0.0, 0.0, 0.1), half_m, turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
+        for k, world in enumerate(worlds)
+    ]
+    return [frame for frame, _ in views], [mask for _, mask in views]
+
+
 def test_a_near_object_that_fills_half_of_the_image_is_not_taken_for_a_moving_camera(rng):
-    frames, masks = [], []
-    for k in range(8):
-        world = World(distance_m=0.45).table()
-        frame, mask = world.box((0.0, 0.0, 0.1), (0.13, 0.1, 0.1), turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
-        frames.append(frame)
-        masks.append(mask)
+    frames, masks = turned_box(0.45, (0.13, 0.1, 0.1), rng)
     assert np.mean([mask.mean() for mask in masks]) > 0.4
     segmenter = Segmenter()
     scene = segmenter.scene(frames)
@@ -260,12 +265,7 @@ def test_a_near_object_that_fills_half_of_the_image_is_not_taken_for_a_moving_ca
 
 def test_an_object_that_the_image_cuts_off_in_all_frames_is_found_as_far_as_it_is_seen(rng):
     """Its own sides at the image's edge are no walls, nor is it an arm that something else would be left without."""
-    frames, masks = [], []
-    for k in range(8):
-        world = World(distance_m=0.42).table()
-        frame, mask = world.box((0.0, 0.0, 0.1), (0.12, 0.07, 0.1), turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
-        frames.append(frame)
-        masks.append(mask)
+    frames, masks = turned_box(0.42, (0.12, 0.07, 0.1), rng)
     segmenter = Segmenter()
     scene = segmenter.scene(frames)
     assert not scene.arms
