@@ -1,4 +1,4 @@
-# make demo       model the bundled box sequence into runs/demo: a minute the first time, of which setup 50 s, then 10 s
+# make demo       model the bundled box sequence into runs/demo: one to two minutes the first time, nearly all of it setup, then 10 s
 # make setup      prepare .venv for all commands (one to two minutes more, quick if that is done)
 # make test       the whole gate: format, lint, types, layers, tests (twelve minutes on two cores; installs the extra dev)
 # make test-slow  the slow tests, which make test leaves out
