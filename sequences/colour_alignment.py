@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, final, get_args
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 from scipy.fft import next_fast_len
 
-from modeler.types import Array, Frame
+from modeler.types import FLIPS, Array, Flip, Frame
 
 _WIDTH: Final = 160  # px to which images are shrunk
 _REACH: Final = 0.2  # of the width: largest shift
@@ -19,9 +19,6 @@ _SCALES: Final = np.exp(0.05 * np.arange(-7, 8))
 _ASPECTS: Final = (1.0, 0.75, 0.866, 1.155, 1.333)  # of 4 : 3, 3 : 2 and 16 : 9 in each other
 _EDGE: Final = 0.03  # relative second difference of inverse depth, which is linear over planes
 _LEAST_EDGES: Final = 12.0  # px at that size, mean over the frames
-
-
-Flip = Literal["", "mirrored", "upside down", "flipped top to bottom"]
 
 
 @final
@@ -191,7 +188,7 @@ class _Search:
         An image turned by 180 degrees has the conjugate spectrum, but for a phase; a mirrored one that of the opposite
         frequency across, or down.
         """
-        sums = {flip: np.zeros_like(self._colour[0]) for flip in get_args(Flip)}
+        sums: dict[Flip, npt.NDArray[np.complex128]] = {flip: np.zeros_like(self._colour[0]) for flip in FLIPS}
         count = 1.0
         for depth, colour in zip(self._depth, self._colour, strict=True):
             moved = depth if scale == (1.0, 1.0) else _resized(depth, scale)

@@ -9,24 +9,31 @@ import numpy as np
 import pytest
 from scipy import ndimage
 from test_inputs_plain_errors import colour_as
-from test_verdict import CAMERA, poses_of, turned, views_of, whole_run
+from test_verdict import CAMERA, MIDDLE, poses_of, seen, turned, views_of, whole_run
 
 from modeler import se3
 from modeler.kernels.colour_fit import displaced_correlations
-from modeler.types import RayImage
+from modeler.types import FLIPS, Array, Flip, RayImage
 from modeler.verdict.colour_fit import Displacement, colour_fit
 
 ANGLES_DEG = [20.0 * k for k in range(8)]
 
 
+def from_above(angle_deg: float, above_deg: float) -> Array:
+    """Return camera_from_object (4, 4) of `turned` for a camera that looks down on it."""
+    tilt = se3.exp(np.array([np.radians(above_deg), 0.0, 0.0, 0.0, 0.0, 0.0]))
+    return np.asarray(MIDDLE @ tilt @ se3.inverse(MIDDLE) @ turned(angle_deg))
+
+
 @cache
-def printed(contrast: float = 1.0, *, noise: float = 1.0) -> dict[int, RayImage]:
+def printed(contrast: float = 1.0, *, noise: float = 1.0, above_deg: float = 0.0) -> dict[int, RayImage]:
     """Return views of an ellipsoid with a print, before a wall with a pattern of its own."""
-    rng, views = np.random.default_rng(5), views_of(ANGLES_DEG)
+    rng = np.random.default_rng(5)
+    views = {index: seen(index, from_above(angle_deg, above_deg)) for index, angle_deg in enumerate(ANGLES_DEG)}
     waves, phases = rng.normal(scale=350.0, size=(20, 3)), rng.uniform(0.0, 2.0 * np.pi, 20)
     wall = 100.0 + 30.0 * ndimage.gaussian_filter(rng.normal(size=(CAMERA.height, CAMERA.width)), 2.0) / 0.14
     for index, view in views.items():
-        points_m = se3.transform(se3.inverse(turned(ANGLES_DEG[index])), view.points_m)
+        points_m = se3.transform(se3.inverse(from_above(ANGLES_DEG[index], above_deg)), view.points_m)
         image = wall.copy()
         image[view.pixels[:, 0], view.pixels[:, 1]] = 120.0 + 12.0 * contrast * np.sum(
             np.sin(points_m @ waves.T + phases), axis=1
@@ -73,9 +80,23 @@ def test_displaced_colour_is_found(
     fit = colour_fit(changed(printed(), **how), poses_of(ANGLES_DEG))
     assert fit is not None
     assert not fit.check.holds
-    assert fit.displacement.flips[0] == across
+    assert FLIPS[fit.displacement.flip][0] == across
     assert fit.displacement.scale == pytest.approx(scale, abs=0.06)
     assert fit.displacement.shift_px[0] == pytest.approx(shift_px[0], abs=2.0)
+
+
+@pytest.mark.parametrize("flip", [flip for flip in FLIPS if flip])
+def test_colour_that_is_turned_over_is_found(flip: Flip) -> None:
+    views, poses = printed(above_deg=35.0), [from_above(angle_deg, 35.0) for angle_deg in ANGLES_DEG]
+    across, down = map(int, FLIPS[flip])
+    for index, view in views.items():
+        assert view.frame.colour is not None
+        colour = np.ascontiguousarray(view.frame.colour[::down, ::across])
+        views = views | {index: replace(view, frame=replace(view.frame, colour=colour))}
+    fit = colour_fit(views, {index: se3.inverse(pose) for index, pose in enumerate(poses)})
+    assert fit is not None
+    assert not fit.check.holds
+    assert str(fit.displacement) == f"is {flip}"
 
 
 def test_colour_of_the_frame_before_is_found() -> None:
@@ -113,10 +134,10 @@ def test_a_run_with_colour_of_another_camera_is_not_trusted(monkeypatch: pytest.
 def test_correlations_are_those_of_interpolated_values(rng: np.random.Generator) -> None:
     images = rng.normal(size=(2, 30, 40))
     places = rng.uniform((8.0, 8.0) * 2, (30.0, 20.0) * 2, (50, 4))
-    shift = Displacement(1.1, (1.5, -0.7), (-1.0, 1.0))
+    shift = Displacement(1.1, (1.5, -0.7), "mirrored")
     found = displaced_correlations(images, np.array([[0, 1]]), np.array([0, 50]), places, shift.row()[None])
     middle, values = np.array([19.5, 14.5]), []
     for image, at in zip(images, (places[:, :2], places[:, 2:]), strict=True):
-        column, row = (middle + shift.flips * (shift.scale * (at - middle) + shift.shift_px)).T
+        column, row = (middle + FLIPS[shift.flip] * (shift.scale * (at - middle) + shift.shift_px)).T
         values.append(ndimage.map_coordinates(image, [row, column], order=1))
     assert found[0, 0] == pytest.approx(np.corrcoef(*values)[0, 1])

@@ -68,9 +68,11 @@ from modeler.types.verdict import Shortcoming as Shortcoming
 from modeler.types.verdict import Verdict as Verdict
 from modeler.types.views import CALIBRATED_FOCAL as CALIBRATED_FOCAL
 from modeler.types.views import COLOUR_SHIFT_PX as COLOUR_SHIFT_PX
+from modeler.types.views import FLIPS as FLIPS
 from modeler.types.views import MULTIPATH as MULTIPATH
 from modeler.types.views import NOMINAL_FOCAL as NOMINAL_FOCAL
 from modeler.types.views import Camera as Camera
+from modeler.types.views import Flip as Flip
 from modeler.types.views import Frame as Frame
 from modeler.types.views import HandPoses as HandPoses
 from modeler.types.views import Intrinsics as Intrinsics

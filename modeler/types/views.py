@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,14 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.types.base import Array, BoolArray, InputError, Outcome
 
+Flip = Literal["", "mirrored", "upside down", "flipped top to bottom"]
+FLIPS: Final[Mapping[Flip, tuple[float, float]]] = {
+    "": (1.0, 1.0),
+    "mirrored": (-1.0, 1.0),
+    "upside down": (-1.0, -1.0),
+    "flipped top to bottom": (1.0, -1.0),
+}
+"""Ways in which programs turn over colour against depth: -1 for left and right exchanged, and for top and bottom."""
 _FARTHEST_M = 20.0  # that a depth camera for objects measures
 _KINDS = {"f": "floating-point numbers", "b1": "bool", "u1": "8-bit integers"}
 

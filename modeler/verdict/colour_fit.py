@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from modeler import se3
 from modeler.kernels.colour_fit import displaced_correlations
-from modeler.types import Array, BoolArray, Check, RayImage
+from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage
 
 _MAX_VIEWS: Final = 40  # spread over the run: steps of 9° in a full turn
 _PAIRS: Final = 12  # of views that are compared, spread over the run: one has a sd of some 0.1
@@ -31,7 +31,6 @@ _STRIDE: Final = 4  # every fourth point is used for the search: 12 pairs have a
 _BLACK: Final = 4.0  # added to 8-bit values, as in registration
 _REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: baselines of 15 to 50 mm at half a metre
 _LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
-_FLIPS: Final = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0))
 _CHANCE_SDS: Final = 5.0  # of a correlation by chance: one of 10⁶ places, where several thousand are searched
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
 _NORMAL_QUARTILE: Final = 0.6745  # median magnitude of a standard normal variable
@@ -47,24 +46,22 @@ class Displacement:
     """Size of things in colour relative to depth, about the middle of the image."""
     shift_px: tuple[float, float] = (0.0, 0.0)
     """Shift of colour against depth, right and down."""
-    flips: tuple[float, float] = (1.0, 1.0)
-    """-1 along an axis along which colour is mirrored."""
+    flip: Flip = ""
+    """How colour is turned over."""
     frames: int = 0
     """Number of frames by which the time of colour is after that of depth."""
 
     def row(self) -> Array:
         """Return it (5,) for the kernel."""
-        return np.array([self.scale, *self.shift_px, *self.flips])
+        return np.array([self.scale, *self.shift_px, *FLIPS[self.flip]])
 
     def moved(self, places: Array, shape: tuple[int, ...]) -> Array:
         """Return where places (n, 2) of depth, columns and rows, are in images of colour of a shape (h, w)."""
         middle = np.array([0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)])
-        return np.asarray(middle + self.flips * (self.scale * (places - middle) + self.shift_px))
+        return np.asarray(middle + FLIPS[self.flip] * (self.scale * (places - middle) + self.shift_px))
 
     def __str__(self) -> str:
-        parts = []
-        if self.flips != (1.0, 1.0):
-            parts.append("is upside down" if self.flips[1] < 0.0 else "is mirrored")
+        parts = [f"is {self.flip}"] if self.flip else []
         if self.frames:
             parts.append(f"is of the frame {'after' if self.frames > 0 else 'before'}")
         if abs(self.scale - 1.0) > 0.02:
@@ -297,7 +294,7 @@ class _Comparison:
         order = np.argsort(-scores, kind="stable")
         some = self.correlations([grid[k] for k in order[:: max(len(order) // 100, 1)]], fine_px).mean(axis=1)
         chance = float(np.median(np.abs(some))) / _NORMAL_QUARTILE
-        groups = {(grid[k].flips, grid[k].scale): k for k in reversed(order)}  # the best shift under each
+        groups = {(grid[k].flip, grid[k].scale): k for k in reversed(order)}  # the best shift under each
         tried = [self._refined(grid[k]) for k in groups.values()]
         times = [Displacement(frames=frames) for frames in (-1, 1) if len(self.views) > 2]
         tried += [(each, self.correlation(each, fine_px)) for each in times]
@@ -311,11 +308,11 @@ class _Comparison:
         """Yield displacements as far apart as the coarse band is wide."""
         width = self.features(step_px).shape[2]
         across, down = (np.arange(-int(reach * width / step_px), int(reach * width / step_px) + 1) for reach in _REACH)
-        for flips in _FLIPS:
+        for flip in FLIPS:
             for log_scale in _LOG_SCALES:
                 for x in across:
                     for y in down:
-                        yield Displacement(float(np.exp(log_scale)), (step_px * float(x), step_px * float(y)), flips)
+                        yield Displacement(float(np.exp(log_scale)), (step_px * float(x), step_px * float(y)), flip)
 
     def _refined(self, start: Displacement) -> tuple[Displacement, float]:
         """Return the best displacement near one of the coarse search, in the fine band, and its correlation."""
@@ -328,7 +325,7 @@ class _Comparison:
                 Displacement(
                     best.scale * float(np.exp(s * step_px / half_px)),
                     (best.shift_px[0] + x * step_px, best.shift_px[1] + y * step_px),
-                    best.flips,
+                    best.flip,
                 )
                 for x, y, s in steps
                 if abs(np.log(best.scale) + s * step_px / half_px) <= _LOG_SCALES[-1]
