@@ -18,6 +18,7 @@ import tempfile
 import time
 import traceback
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import FrameType
 
@@ -46,27 +47,21 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=100_000, help="how many in all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--target", choices=TARGETS, help="only this one, in this process")
+    parser.add_argument("--jobs", type=int, default=1, help="how many formats at a time")
     options = parser.parse_args()
     if options.target is not None:
         return one(options.target, options.inputs, options.seed)
-    total, failed, began = sum(target.share for target in TARGETS.values()), [], time.monotonic()
-    for name, target in TARGETS.items():
-        count = round(options.inputs * target.share / total)
-        command = [
-            sys.executable,
-            "-m",
-            "studies",
-            "fuzz",
-            "--target",
-            name,
-            "--inputs",
-            str(count),
-            "--seed",
-            str(options.seed),
+    total, began = sum(target.share for target in TARGETS.values()), time.monotonic()
+
+    def status(name: str) -> int:
+        count = round(options.inputs * TARGETS[name].share / total)
+        words = ["fuzz", "--target", name, "--inputs", str(count), "--seed", str(options.seed)]
+        return subprocess.run([sys.executable, "-m", "studies", *words], check=False).returncode
+
+    with ThreadPoolExecutor(options.jobs) as pool:
+        failed = [
+            f"{name} (status {ended})" for name, ended in zip(TARGETS, pool.map(status, TARGETS), strict=True) if ended
         ]
-        status = subprocess.run(command, check=False).returncode
-        if status != 0:
-            failed.append(f"{name} (status {status})")
     print(f"{options.inputs} inputs in {time.monotonic() - began:.0f} s; failed: {', '.join(failed) or 'none'}")
     return 1 if failed else 0
 

@@ -1,6 +1,7 @@
 """Run commands in hostile environments, and tell where one ends in a traceback, hangs, or leaves a process behind.
 
     python -m studies hostile --count 500 --seed 0
+    python -m studies hostile --first 173 --jobs 12 --seconds 300      on a machine with 16 cores
 
 Each trial is one command under one to three faults: settings of libraries, damaged caches of kernels, what lies in the
 current folder, limits, closed streams, a viewer that stays silent, a signal at any moment. A command must end with
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -230,7 +232,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m studies hostile", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--count", type=int, default=500, help="how many trials")
+    parser.add_argument("--count", type=int, default=500, help="number of the last trial")
+    parser.add_argument("--first", type=int, default=1, help="number of the first")
+    parser.add_argument("--jobs", type=int, default=1, help="how many trials at a time")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no trial after so long")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/hostile"), help="folder of the trials, which is emptied")
@@ -245,29 +249,34 @@ def main() -> int:
     write_bop(scene, small_frames(3), small_truth(3), depth_scale_mm=1.0)
     built = [sys.executable, "-m", "modeler", "build", str(scene), "--out", str(run), *_FEW]
     assert subprocess.run(built, env=environment, check=False, stderr=subprocess.DEVNULL).returncode in _ENDED
-    began_s, failed, count = time.monotonic(), 0, 0
-    with socket.create_server(("127.0.0.1", 0)) as silent:
+    began_s = time.monotonic()
+
+    def tried(number: int) -> str | None:
+        """Return what is wrong with the end of a trial; None if there was no time for it."""
+        if time.monotonic() - began_s > options.seconds:
+            return None
+        rng = np.random.default_rng([options.seed, number])
+        name, folder = str(rng.choice(list(COMMANDS))), out / f"{number:04d}"
+        trial = Trial(folder, {**environment, "NUMBA_CACHE_DIR": str(folder / "cache")})
+        for part in ("out", "here"):
+            (folder / part).mkdir(parents=True)
+        shutil.copytree(cache.folder(), folder / "cache" / cache.folder().name)
+        for k in rng.choice(len(FAULTS), rng.integers(1, 4), replace=False):
+            FAULTS[k](trial, rng)
+        if name == "build" and rng.random() < 0.3:
+            trial.options = ("--connect", address)
+            trial.said.append("a silent viewer")
+        command = tuple(word.format(out=folder / "out", scene=scene, run=run) for word in COMMANDS[name])
+        fault = outcome(trial, command)
+        print(f"{number:4d} {name:9} {'; '.join(trial.said):60} {fault or 'ended well'}", flush=True)
+        shutil.rmtree(folder)
+        return fault
+
+    with socket.create_server(("127.0.0.1", 0)) as silent, ThreadPoolExecutor(options.jobs) as pool:
         address = f"rerun+http://127.0.0.1:{silent.getsockname()[1]}/proxy"
-        for count in range(1, options.count + 1):
-            if time.monotonic() - began_s > options.seconds:
-                break
-            rng = np.random.default_rng([options.seed, count])
-            name, folder = str(rng.choice(list(COMMANDS))), out / f"{count:04d}"
-            trial = Trial(folder, {**environment, "NUMBA_CACHE_DIR": str(folder / "cache")})
-            for part in ("out", "here"):
-                (folder / part).mkdir(parents=True)
-            shutil.copytree(cache.folder(), folder / "cache" / cache.folder().name)
-            for k in rng.choice(len(FAULTS), rng.integers(1, 4), replace=False):
-                FAULTS[k](trial, rng)
-            if name == "build" and rng.random() < 0.3:
-                trial.options = ("--connect", address)
-                trial.said.append("a silent viewer")
-            command = tuple(word.format(out=folder / "out", scene=scene, run=run) for word in COMMANDS[name])
-            fault = outcome(trial, command)
-            failed += bool(fault)
-            print(f"{count:4d} {name:9} {'; '.join(trial.said):60} {fault or 'ended well'}", flush=True)
-            shutil.rmtree(folder)
-    print(f"{failed} of {count} trials failed in {time.monotonic() - began_s:.0f} s")
+        faults = [fault for fault in pool.map(tried, range(options.first, options.count + 1)) if fault is not None]
+    failed = sum(map(bool, faults))
+    print(f"{failed} of {len(faults)} trials failed in {time.monotonic() - began_s:.0f} s")
     return 1 if failed else 0
 
 
