@@ -26,14 +26,20 @@ def from_above(angle_deg: float, above_deg: float) -> Array:
 
 
 @cache
-def printed(contrast: float = 1.0, *, noise: float = 1.0, above_deg: float = 0.0) -> dict[int, RayImage]:
+def printed(
+    contrast: float = 1.0,
+    *,
+    noise: float = 1.0,
+    above_deg: float = 0.0,
+    angles_deg: tuple[float, ...] = tuple(ANGLES_DEG),
+) -> dict[int, RayImage]:
     """Return views of an ellipsoid with a print, before a wall with a pattern of its own."""
     rng = np.random.default_rng(5)
-    views = {index: seen(index, from_above(angle_deg, above_deg)) for index, angle_deg in enumerate(ANGLES_DEG)}
+    views = {index: seen(index, from_above(angle_deg, above_deg)) for index, angle_deg in enumerate(angles_deg)}
     waves, phases = rng.normal(scale=350.0, size=(20, 3)), rng.uniform(0.0, 2.0 * np.pi, 20)
     wall = 100.0 + 30.0 * ndimage.gaussian_filter(rng.normal(size=(CAMERA.height, CAMERA.width)), 2.0) / 0.14
     for index, view in views.items():
-        points_m = se3.transform(se3.inverse(from_above(ANGLES_DEG[index], above_deg)), view.points_m)
+        points_m = se3.transform(se3.inverse(from_above(angles_deg[index], above_deg)), view.points_m)
         image = wall.copy()
         image[view.pixels[:, 0], view.pixels[:, 1]] = 120.0 + 12.0 * contrast * np.sum(
             np.sin(points_m @ waves.T + phases), axis=1

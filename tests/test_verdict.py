@@ -462,6 +462,7 @@ def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:
             "free_space_violations",
             "false_surface",
             "other_modes",
+            "flat_frames",
             "pose_sd_deg",
             "pose_sd_m",
         ),

@@ -55,9 +55,9 @@ class Shortcoming:
 
     code: str
     """For programs: `interrupted`, `unfinished`, `left_out`, `too_few_frames`, `unsure_masks`, `no_motion`,
-    `prior_contradicted`, `colour_misaligned`, `loop_open`, `edges_disagree`, `closures_refused`, `unconfirmed`,
-    `never_came_back`, `not_tried`, `free_space_violations`, `false_surface`, `other_modes`, `unsure_rotation`,
-    `unsure_place`, `unsure_focal` or `unsure_size`."""
+    `prior_contradicted`, `colour_misaligned`, `print_contradicts`, `flat_match`, `loop_open`, `edges_disagree`,
+    `closures_refused`, `unconfirmed`, `never_came_back`, `not_tried`, `free_space_violations`, `false_surface`,
+    `other_modes`, `unsure_rotation`, `unsure_place`, `unsure_focal` or `unsure_size`."""
     words: str
     """For people."""
 
@@ -81,8 +81,8 @@ class Verdict:
     """Reasons not to trust it; empty if it can be trusted."""
     checks: Mapping[str, Check] = field(default_factory=dict)
     """By name, after the last step: `unsure_masks`, `motion_m`, `prior_sds`, `prior_chi2`, `loop_sigmas`,
-    `graph_chi2`, `free_space_violations`, `false_surface`, `other_modes`, `colour_fit`, `pose_sd_deg`, `pose_sd_m` and
-    `size_m`, as available."""
+    `graph_chi2`, `free_space_violations`, `false_surface`, `other_modes`, `colour_fit`, `print_fit`, `flat_frames`,
+    `pose_sd_deg`, `pose_sd_m` and `size_m`, as available."""
     tolerance_m: float = 0.0
     """Error of the surface above which a model is called wrong."""
     contradicted: Mapping[int, Contradictions] = field(default_factory=dict)

@@ -234,6 +234,7 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
     by_code: dict[str, Callable[[Mapping[str, Any], AbstractPrior], Remedy | None]] = {
         "left_out": _at_limit,
         "colour_misaligned": _without_colour,
+        **dict.fromkeys(("print_contradicts", "flat_match"), _sides),
         "prior_contradicted": _without_prior,
         **dict.fromkeys(("unsure_masks", "no_motion"), _region),
         **dict.fromkeys(("loop_open", "edges_disagree"), _camera),
@@ -257,6 +258,15 @@ def _urgency(code: str) -> int:
 def _without_colour(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
     """Return how to do without colour."""
     return Remedy("record colour that is aligned to depth, or register by depth alone", {"no_colour": ""})
+
+
+def _sides(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:
+    """Return how to tell sides that are alike apart."""
+    return Remedy(
+        "record again in smaller steps, from higher up and with all of the object in the image, so that each frame "
+        "shows two sides or the top; or state how far it turns at most",
+        {} if turntable_in(prior) is not None else {"max_rotation_deg": "DEG"},
+    )
 
 
 def _region(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import ndimage
@@ -18,23 +19,24 @@ from modeler import se3
 from modeler.kernels.colour_fit import displaced_correlations
 from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage
 
-_MAX_VIEWS: Final = 40  # spread over the run: steps of 9° in a full turn
+MAX_VIEWS: Final = 40  # spread over the run: steps of 9° in a full turn
 _PAIRS: Final = 12  # of views that are compared, spread over the run: one has a sd of some 0.1
 _POINTS: Final = 400  # of surface in each
-_NEAR_DEG, _FAR_DEG = 6.0, 50.0  # rotation between views: highlights stay where they are, and surface is shared
-_MIN_SHARED: Final = 60  # points of a pair: the sd of a chance correlation is then 0.13
+NEAR_DEG, FAR_DEG = 6.0, 50.0  # rotation between views: highlights stay where they are, and surface is shared
+MIN_SHARED: Final = 60  # points of a pair: the sd of a chance correlation is then 0.13
 _MIN_COSINE: Final = 0.35  # of surface that is reliable, as in registration
 _MARGIN: Final = 4.0  # widths of the fine band: nearer to its outline, a feature is of the background
 _WIDTH: Final = 0.01  # of the object's extent in px: width of the fine band, at least a pixel
 _COARSE: Final = 2.0  # ratio of the widths of the two bands, and of the steps of the search to the finer one
 _STRIDE: Final = 4  # every fourth point is used for the search: 12 pairs have a thousand
-_BLACK: Final = 4.0  # added to 8-bit values, as in registration
+_LOGS: Final = np.log(np.arange(256) + 4.0).astype(np.float32) / 3.0  # of 8-bit values, as in registration
 _REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: baselines of 15 to 50 mm at half a metre
 _LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
 _CHANCE_SDS: Final = 5.0  # of a correlation by chance: one of 10⁶ places, where several thousand are searched
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
 _NORMAL_QUARTILE: Final = 0.6745  # median magnitude of a standard normal variable
-_AT_LEAST: Final = 0.5  # of the correlation elsewhere, and of that one: less is found by chance on few points
+AT_LEAST: Final = 0.5  # of the correlation elsewhere, and of that one: less is found by chance on few points
+_INNER: Final[WeakKeyDictionary[RayImage, BoolArray]] = WeakKeyDictionary()  # as a view is part of several pairs
 
 
 @final
@@ -87,7 +89,7 @@ class ColourFit:
     def check(self) -> Check:
         """The correlation as a share of that with displaced colour."""
         share = 1.0 if self.elsewhere <= 0.0 else max(self.correlation, 0.0) / self.elsewhere
-        return Check(min(share, 1.0), _AT_LEAST, at_least=True)
+        return Check(min(share, 1.0), AT_LEAST, at_least=True)
 
 
 def colour_fit(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ColourFit | None:
@@ -97,26 +99,27 @@ def colour_fit(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -
         views: by frame number.
         trajectory: object_from_camera (4, 4) by frame number.
     """
-    coloured = {frame: views[frame] for frame in sorted(trajectory) if frame in views and _has_colour(views[frame])}
+    coloured = {frame: views[frame] for frame in sorted(trajectory) if frame in views and has_colour(views[frame])}
     if len({view.frame.colour.shape for view in coloured.values() if view.frame.colour is not None}) != 1:
         return None
-    pairs = [_Pair.of(coloured, trajectory, *names) for names in _spread(coloured, trajectory)]
-    pairs = [pair for pair in pairs if len(pair.points_m) >= _MIN_SHARED]
-    return _Comparison(coloured, trajectory, tuple(pairs)).fit() if pairs else None
+    pairs = [Pair.of(coloured, trajectory, *names) for names in _spread(coloured, trajectory)]
+    pairs = [pair for pair in pairs if len(pair.points_m) >= MIN_SHARED]
+    return Comparison(coloured, trajectory, tuple(pairs)).fit() if pairs else None
 
 
-def _has_colour(view: RayImage) -> bool:
+def has_colour(view: RayImage) -> bool:
+    """Return whether a view shows surface in colours that a camera measured."""
     return view.frame.colour is not None and not view.rendered and len(view.points_m) > 0
 
 
 def _spread(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> list[tuple[int, int]]:
     """Return pairs of views that share surface, spread over the run."""
     frames, found = list(views), []
-    frames = [frames[number] for number in np.unique(np.linspace(0, len(frames) - 1, _MAX_VIEWS).astype(int))]
+    frames = [frames[number] for number in np.unique(np.linspace(0, len(frames) - 1, MAX_VIEWS).astype(int))]
     for place, first in enumerate(frames):
         for second in frames[place + 1 :]:
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(trajectory[first]) @ trajectory[second]))
-            if _NEAR_DEG <= angle_deg <= _FAR_DEG:
+            if NEAR_DEG <= angle_deg <= FAR_DEG:
                 found.append((first, second))
     chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), _PAIRS)).astype(int)) if found else []
     return [found[number] for number in chosen]
@@ -124,35 +127,37 @@ def _spread(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> l
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Pair:
+class Pair:
     """Surface that two views see."""
 
     first: int
+    """Frame number."""
     second: int
+    """Frame number."""
     points_m: Array
     """(n, 3) in the object's frame."""
 
     @staticmethod
-    def of(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], first: int, second: int) -> _Pair:
+    def of(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], first: int, second: int) -> Pair:
         """Return the surface of the second view that the first one sees, too."""
         target, source = views[first], views[second]
-        kept = np.flatnonzero(_inside(source, source.pixels, _MARGIN * _width_px(source)))
+        kept = np.flatnonzero(_inside(source, source.pixels))
         kept = kept[:: max(len(kept) // _POINTS, 1)]
         target_from_source = se3.inverse(trajectory[first]) @ trajectory[second]
         points_m, normals = se3.transform(target_from_source, source.points_m[kept]), source.normals[kept]
         facing = -np.sum(points_m * (normals @ target_from_source[:3, :3].T), axis=1)
         seen = facing >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
-        pixels = np.rint(_places(target, points_m)[:, ::-1]).astype(int)
+        pixels = np.rint(places_in(target, points_m)[:, ::-1]).astype(int)
         height, width = target.frame.depth_m.shape
         seen &= (pixels >= 0).all(axis=1) & (pixels < (height, width)).all(axis=1)
         kept, points_m, pixels = kept[seen], points_m[seen], pixels[seen]
         near = np.abs(target.frame.depth_m[pixels[:, 0], pixels[:, 1]] - points_m[:, 2])
         matched = near < 4.0 * target.sigma_r_m + _WIDTH * target.size_m
-        matched &= _inside(target, pixels, _MARGIN * _width_px(target))
-        return _Pair(first, second, se3.transform(trajectory[second], source.points_m[kept[matched]]))
+        matched &= _inside(target, pixels)
+        return Pair(first, second, se3.transform(trajectory[second], source.points_m[kept[matched]]))
 
 
-def _places(view: RayImage, points_m: Array) -> Array:
+def places_in(view: RayImage, points_m: Array) -> Array:
     """Return column and row (n, 2) of points (n, 3) in a camera's frame; NaN behind it."""
     camera, depth_m = view.frame.camera, np.where(points_m[:, 2] > 0.0, points_m[:, 2], np.nan)
     focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
@@ -164,10 +169,13 @@ def _width_px(view: RayImage) -> float:
     return max(_WIDTH * float(np.sqrt(len(view.pixels))), 1.0)
 
 
-def _inside(view: RayImage, pixels: np.ndarray, margin_px: float) -> np.ndarray:
+def _inside(view: RayImage, pixels: np.ndarray) -> np.ndarray:
     """Return which (n,) pixels (n, 2) are surface and some way from its outline."""
-    far = ndimage.minimum_filter(_surface(view), size=2 * round(margin_px / 2.0) + 1)
-    return np.asarray(far[pixels[:, 0], pixels[:, 1]], dtype=np.bool_)
+    if view not in _INNER:
+        margin_px = _MARGIN * _width_px(view)
+        inner = ndimage.minimum_filter(_surface(view), size=2 * round(margin_px / 2.0) + 1)
+        _INNER[view] = np.asarray(inner, dtype=np.bool_)
+    return np.asarray(_INNER[view][pixels[:, 0], pixels[:, 1]], dtype=np.bool_)
 
 
 def _surface(view: RayImage) -> BoolArray:
@@ -186,19 +194,19 @@ def _outline(view: RayImage) -> Array:
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Comparison:
+class Comparison:
     """Colours of pairs of views, compared under displacements."""
 
     views: Mapping[int, RayImage]
     trajectory: Mapping[int, Array]
-    pairs: Sequence[_Pair]
+    pairs: Sequence[Pair]
 
     def fit(self) -> ColourFit:
         """Return how colours agree, and the best displacement if they agree poorly where they are."""
         fine_px, here = self.width_px, Displacement()
         correlation = self.correlation(here, fine_px)
         best, elsewhere = here, correlation
-        if correlation < _AT_LEAST:  # else no place is twice as good
+        if correlation < AT_LEAST:  # else no place is twice as good
             best, elsewhere = self._elsewhere(correlation)
         return ColourFit(correlation, elsewhere, best)
 
@@ -228,18 +236,18 @@ class _Comparison:
     def _at_times(self) -> dict[int, Array]:
         return {}
 
+    def feature(self, frame: int, width_px: float) -> np.ndarray:
+        """Return the band-passed logarithms (h, w) of a view's colours, as (7.1) but over the whole image."""
+        colour = self.views[frame].frame.colour
+        assert colour is not None
+        logs = _LOGS[colour].sum(axis=-1)
+        near, wide = (ndimage.gaussian_filter(logs, ratio * width_px) for ratio in (1.0, 2.0))
+        return np.asarray(near - wide)
+
     def features(self, width_px: float) -> np.ndarray:
-        """Return the band-passed logarithms (v, h, w) of the views' colours, as (7.1) but over the whole image."""
+        """Return those of all views that are compared (v, h, w)."""
         if width_px not in self._features:
-            table = np.log(np.arange(256) + _BLACK).astype(np.float32) / 3.0
-            found = []
-            for frame in self._frames:
-                colour = self.views[frame].frame.colour
-                assert colour is not None
-                logs = table[colour].sum(axis=-1)
-                near, wide = (ndimage.gaussian_filter(logs, ratio * width_px) for ratio in (1.0, 2.0))
-                found.append(near - wide)
-            self._features[width_px] = np.stack(found)
+            self._features[width_px] = np.stack([self.feature(frame, width_px) for frame in self._frames])
         return self._features[width_px]
 
     def places(self, frames: int) -> Array:
@@ -255,7 +263,7 @@ class _Comparison:
                         sides.append(np.full((len(pair.points_m), 2), np.nan))
                         continue
                     camera_from_object = se3.inverse(self.trajectory[order[place]])
-                    sides.append(_places(self.views[frame], se3.transform(camera_from_object, pair.points_m)))
+                    sides.append(places_in(self.views[frame], se3.transform(camera_from_object, pair.points_m)))
                 parts.append(np.concatenate(sides, axis=1))
             self._at_times[frames] = np.concatenate(parts)
         return self._at_times[frames]
@@ -299,7 +307,7 @@ class _Comparison:
         times = [Displacement(frames=frames) for frames in (-1, 1) if len(self.views) > 2]
         tried += [(each, self.correlation(each, fine_px)) for each in times]
         best, found = max(tried, key=lambda each: each[1])
-        clear = found >= max(_AT_LEAST, correlation + _CHANCE_SDS * chance)
+        clear = found >= max(AT_LEAST, correlation + _CHANCE_SDS * chance)
         # A plain object on a printed table that turns with it agrees where colour is that of the table.
         outlined = self.edges(best) > _OUTLINED * self.edges(here)
         return (best, found) if clear and outlined else (here, correlation)

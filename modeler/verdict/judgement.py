@@ -47,6 +47,7 @@ from modeler.verdict.evidence import (
     prior_check,
     prior_distances,
 )
+from modeler.verdict.likeness import flat_check, likenesses, print_check
 from modeler.verdict.spreads import (
     AboutMean,
     misfit,
@@ -95,6 +96,7 @@ def judged(
     free = free_space(step.views, step.solution.trajectory, tolerance_m) if step.last else None
     found = _found(step, frames, edges, prior, tolerance_m, free=free) if step.last else []
     found += _colour(step) if step.last and colour else []
+    found += _alike(step, edges, prior, tolerance_m, colour=colour) if step.last else []
     reasons += _against(found)
     reasons += _open_loop(step, edges, closure_expected=closure_expected)
     reasons += _unconfirmed_join(edges)
@@ -206,6 +208,31 @@ def _colour(step: Step) -> list[_Finding]:
         f"{fit.correlation:.2f}, and {fit.elsewhere:.2f} if it {fit.displacement}: is it aligned?"
     )
     return [_Finding("colour_fit", fit.check, "colour_misaligned", words)]
+
+
+def _alike(
+    step: Step, edges: Sequence[Edge], prior: AbstractPrior | None, tolerance_m: float, *, colour: bool
+) -> list[_Finding]:
+    """Return whether views that match may show different sides that are alike, as far as print and shape tell."""
+    joined = {(min(edge.source, edge.target), max(edge.source, edge.target)) for edge in edges}
+    pairs = likenesses(step.views, step.solution.trajectory, tolerance_m, joined, colour=colour)
+    found = []
+    if (by_print := print_check(pairs)) is not None:
+        pair, check = by_print
+        words = (
+            f"print contradicts that frames {pair.first} and {pair.second} show the same surface: it correlates by "
+            f"{pair.correlation:.2f}, {100.0 * check.value:.0f} % of what that of others does"
+        )
+        found.append(_Finding("print_fit", check, "print_contradicts", words))
+    places = {frame: place for place, frame in enumerate(sorted(frame.id for frame in step.frames_so_far))}
+    if (by_shape := flat_check(pairs, step.views, places, prior)) is not None:
+        frame, check = by_shape
+        words = (
+            f"{check.value:.0f} frames, {frame} among them, match the others by part of a flat face alone, which "
+            "another side of the object may match as well"
+        )
+        found.append(_Finding("flat_frames", check, "flat_match", words))
+    return found
 
 
 def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Finding]:

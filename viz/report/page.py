@@ -431,6 +431,17 @@ CHECKS: Final = {
         100.0,
         " %",
     ),
+    "print_fit": Check(
+        "agreement of print between frames that match",
+        "Least correlation of two frames that no chain of agreeing ones joins, as a share of that of others. Less: "
+        "they show different sides.",
+        100.0,
+        " %",
+    ),
+    "flat_frames": Check(
+        "frames that match the others by one flat face",
+        "Another side of a box matches as well, and neither print nor the motion told excludes it.",
+    ),
     "pose_sd_deg": Check(
         "largest sd of a pose's rotation", "At the limit, one pose in twenty is off by more than 3°.", 1.0, "°"
     ),
