@@ -97,6 +97,24 @@ def test_depth_is_that_of_the_mesh_in_its_true_pose(camera: str) -> None:
     assert np.array_equal(again.depth_m, frame.depth_m, equal_nan=True)
 
 
+@pytest.mark.parametrize(
+    ("camera", "told", "intrinsics", "sensor"),
+    [
+        ("time of flight", True, "nominal", (0.02, 0.1)),
+        ("time of flight", True, "device", (0.005, 0.1)),
+        ("time of flight", False, "exact", None),
+        ("stereo", True, "device", (0.005, 0.0)),
+        ("stereo", True, "exact", None),
+    ],
+)
+def test_a_camera_is_told_as_far_as_it_was_drawn(
+    camera: str, told: bool, intrinsics: str, sensor: tuple[float, float] | None
+) -> None:
+    drawn = replace(_drawn(1)[0], camera=camera, kind_told=told, intrinsics=intrinsics)
+    found = Capture(drawn, 0, THINGS, PICTURES).sensor()
+    assert (None if found is None else (found.sigma_focal, found.sigma_multipath)) == sensor
+
+
 def test_steps_are_as_they_are_called() -> None:
     drawn = Plan("tuning", 0).factors(THINGS, len(PICTURES))
     drawn = replace(drawn, support="turntable", step_deg=20.0, frames=12, order="as turned")

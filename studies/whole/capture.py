@@ -15,7 +15,16 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.composition.options import PriorOptions
 from modeler.sequences import AbstractSequence
-from modeler.types import CALIBRATED_FOCAL, Array, BoolArray, Camera, Frame, SensorNoise
+from modeler.types import (
+    CALIBRATED_FOCAL,
+    MULTIPATH,
+    NOMINAL_FOCAL,
+    Array,
+    BoolArray,
+    Camera,
+    Frame,
+    SensorNoise,
+)
 from studies.whole.cameras import KINDS, Lens, Seen
 from studies.whole.plan import Factors, motion, signed_step_deg
 from studies.whole.things import Thing
@@ -58,10 +67,13 @@ class Capture(AbstractSequence):
         return tuple(range(self.factors.frames))
 
     def sensor(self) -> SensorNoise | None:
-        """Return what a device says of its focal length; None if nothing is said."""
-        return (
-            SensorNoise(sigma_r_m=None, sigma_focal=CALIBRATED_FOCAL) if self.factors.intrinsics == "device" else None
-        )
+        """Return what is known of the camera's kind and focal length; None if nothing is."""
+        drawn = self.factors
+        told = drawn.kind_told and drawn.camera == "time of flight"
+        if not told and drawn.intrinsics != "device":
+            return None
+        focal = CALIBRATED_FOCAL if drawn.intrinsics == "device" else NOMINAL_FOCAL
+        return SensorNoise(sigma_r_m=None, sigma_focal=focal, sigma_multipath=MULTIPATH["tof"] if told else 0.0)
 
     def truth(self) -> dict[int, Array]:
         """Return the true camera_from_model (4, 4) by frame number."""

@@ -79,6 +79,8 @@ class Factors:
     """Where they come from."""
     focal_error: float
     """Logarithm of the given focal length over the true one."""
+    kind_told: bool
+    """Whether the camera's kind is known, as formats of devices say it and folders may."""
 
     @property
     def share(self) -> float:
@@ -158,6 +160,7 @@ class Plan:
             told=bool(rng.random() < 0.4),
             intrinsics=intrinsics,
             focal_error=float(rng.normal(0.0, {"exact": 0.0, "device": 0.003, "nominal": 0.02}[intrinsics])),
+            kind_told=bool(rng.random() < 0.5) or intrinsics == "device",
         )
 
 
