@@ -156,7 +156,7 @@ def read_labels(path: Path) -> npt.NDArray[np.uint8]:
         InputError: if the file is missing, broken or too large.
     """
     pixels, is_grey = _mask_pixels(path)
-    soft, few = is_soft(pixels), len(np.unique(pixels)) <= _FEW_LABELS
+    soft, few = is_soft(pixels), len(_values(pixels)) <= _FEW_LABELS
     own = pixels >= np.ceil(pixels.max() / 2) if soft else pixels != 0
     occluded = (pixels == OCCLUDED) & (is_grey and (few or not soft))  # a palette numbers things
     return np.where(occluded, OCCLUDED, np.where(own, 255, 0)).astype(np.uint8)
@@ -181,9 +181,14 @@ def is_soft(pixels: npt.NDArray[Any]) -> bool:
     """Return whether a mask (h, w) is graded between black and white, instead of a few labels."""
     if pixels.dtype != np.uint8 or pixels.max(initial=0) < _WHITE:
         return False
-    values = np.unique(pixels)
+    values = _values(pixels)
     between = values[(values > 0) & (values < values[-1]) & (values != OCCLUDED)]
     return len(between) > _FEW_LABELS or values[0] > 0 or bool(between.size and between[0] <= _VEIL)
+
+
+def _values(pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the values that occur, ascending."""
+    return np.flatnonzero(np.bincount(pixels.ravel())) if pixels.dtype == np.uint8 else np.unique(pixels)
 
 
 def graded(path: Path) -> bool:

@@ -33,9 +33,17 @@ QUICK = ("--prior", "table", "--voxel-m", "0.004", "--frames", "0:3")
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def box(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene that says what is known of its camera and motion."""
+    folder = shutil.copytree(scene, tmp_path_factory.mktemp("known") / "box")
+    shutil.copy(bundled("box") / "sequence.json", folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def built(box: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("built") / "run"
-    assert main(["build", BOX, "--out", str(folder), *QUICK]) == 0
+    assert main(["build", str(box), "--out", str(folder), *QUICK]) == 0
     return folder
 
 
@@ -145,22 +153,24 @@ def test_a_reader_who_has_left_is_no_error(arguments: tuple[str, ...]) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("info", BOX)])
-def test_a_full_disk_under_stdout_is_reported_in_one_line(arguments: tuple[str, ...]) -> None:
-    command = [sys.executable, "-m", "modeler", *arguments]
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("info", "SCENE")])
+def test_a_full_disk_under_stdout_is_reported_in_one_line(
+    cli: Run, scene: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+) -> None:
     with Path("/dev/full").open("w") as full:
-        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert ended.returncode == 2
-    assert re.fullmatch(r"modeler: .*No space left on device.*\n", ended.stderr)
+        monkeypatch.setattr(sys, "stdout", full)
+        ended = cli(*(scene if argument == "SCENE" else argument for argument in arguments))
+    assert ended.status == 2
+    assert re.fullmatch(r"modeler: .*No space left on device.*\n", ended.err)
 
 
-def test_register_prints_one_edge_the_same_for_the_same_seed(cli: Run) -> None:
-    ended = cli("register", BOX, "1", "0", "--prior", "table", "--seed", "5")
+def test_register_prints_one_edge_the_same_for_the_same_seed(cli: Run, scene: Path) -> None:
+    ended = cli("register", scene, "1", "0", "--prior", "table", "--seed", "5")
     assert ended.status == 0
     edge = json.loads(ended.out)
     assert (edge["source"], edge["target"], edge["kind"], edge["outcome"]) == (1, 0, "odometry", "converged")
     assert "seconds" not in edge
-    truth = open_sequence(BOX).truth()
+    truth = open_sequence(scene).truth()
     assert truth is not None
     found = np.array(edge["target_from_source"]).reshape(4, 4)
     error = se3.inverse(truth[0] @ se3.inverse(truth[1])) @ found
@@ -168,24 +178,24 @@ def test_register_prints_one_edge_the_same_for_the_same_seed(cli: Run) -> None:
     covariance = np.array(edge["covariance"]).reshape(6, 6)
     assert np.array_equal(covariance, covariance.T)
     assert np.linalg.eigvalsh(covariance)[0] > 0.0
-    assert cli("register", BOX, "1", "0", "--prior", "table", "--seed", "5").out == ended.out
-    assert cli("register", BOX, "1", "0", "--prior", "table", "--seed", "6").out != ended.out
+    assert cli("register", scene, "1", "0", "--prior", "table", "--seed", "5").out == ended.out
+    assert cli("register", scene, "1", "0", "--prior", "table", "--seed", "6").out != ended.out
 
 
-def test_the_sequence_says_what_is_known_and_the_user_is_informed(cli: Run, tmp_path: Path) -> None:
-    given = cli("register", BOX, "1", "0", "--method", "icp")
+def test_the_sequence_says_what_is_known_and_the_user_is_informed(cli: Run, box: Path, tmp_path: Path) -> None:
+    given = cli("register", box, "1", "0", "--method", "icp")
     assert given.status == 0
     assert "prior table" in given.err
-    assert given.out == cli("register", BOX, "1", "0", "--method", "icp", "--prior", "table").out
-    given = cli("register", BOX, "1", "0", "--method", "icp", "--prior", "turntable")
+    assert given.out == cli("register", box, "1", "0", "--method", "icp", "--prior", "table").out
+    given = cli("register", box, "1", "0", "--method", "icp", "--prior", "turntable")
     assert "step 25°" in given.err
-    ended = cli("build", BOX, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
+    ended = cli("build", box, "--out", tmp_path / "run", "--method", "icp", "--voxel-m", "0.004", "--frames", "0:2")
     assert ended.err.startswith("modeler: prior table")
     assert report(tmp_path / "run")["prior"] == "table"
 
 
-def test_register_gives_the_edge_that_build_finds(cli: Run, built: Path) -> None:
-    edge = json.loads(cli("register", BOX, "1", "0", *QUICK[:2]).out)
+def test_register_gives_the_edge_that_build_finds(cli: Run, box: Path, built: Path) -> None:
+    edge = json.loads(cli("register", box, "1", "0", *QUICK[:2]).out)
     found = report(built)["edges"][0]
     for name in ("source", "target", "outcome", "target_from_source", "covariance", "overlap"):
         assert edge[name] == found[name]
@@ -210,30 +220,30 @@ def test_build_fills_a_run_folder(built: Path) -> None:
     assert (built / "recording.rrd").stat().st_size > 100_000
 
 
-def test_build_says_nothing_on_stdout_and_two_lines_on_stderr(cli: Run, tmp_path: Path) -> None:
-    ended = cli("build", BOX, "--out", tmp_path / "run", *QUICK[:-1], "0:2")
+def test_build_says_nothing_on_stdout_and_two_lines_on_stderr(cli: Run, box: Path, tmp_path: Path) -> None:
+    ended = cli("build", box, "--out", tmp_path / "run", *QUICK[:-1], "0:2")
     assert (ended.status, ended.out) == (0, "")
     assert re.fullmatch(
         r"modeler: 2 of 2 frames, no loop closed, \d+ s: .*\nmodeler: the model can be trusted to .* mm\n", ended.err
     )
 
 
-def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(cli: Run, built: Path, tmp_path: Path) -> None:
+def test_same_seed_same_bytes_and_nothing_is_replaced_unasked(cli: Run, box: Path, built: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(built, folder)
     (folder / "model.ply").write_text("an earlier model")
     (folder / "notes.txt").write_text("the user's own")
-    refused = cli("build", BOX, "--out", folder, *QUICK)
+    refused = cli("build", box, "--out", folder, *QUICK)
     assert refused.status == 2
     assert (folder / "model.ply").read_text() == "an earlier model"
     assert {path.name for path in folder.iterdir()} == FILES | {"notes.txt", ".pairs.done"}
-    assert cli("build", BOX, "--out", folder, *QUICK, "--overwrite").status == 0
+    assert cli("build", box, "--out", folder, *QUICK, "--overwrite").status == 0
     assert contents(folder) == contents(built)
     assert (folder / "notes.txt").read_text() == "the user's own"
 
 
-def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(cli: Run, tmp_path: Path) -> None:
-    ended = cli("build", BOX, "--out", tmp_path, *QUICK, "--max-depth-m", "0.1")
+def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(cli: Run, box: Path, tmp_path: Path) -> None:
+    ended = cli("build", box, "--out", tmp_path, *QUICK, "--max-depth-m", "0.1")
     assert (ended.status, ended.out) == (3, "")
     assert f"frame 0 is left out: {Outcome.TOO_FEW_POINTS.label}" in ended.err
     given = report(tmp_path)
@@ -272,8 +282,8 @@ def test_kiss_is_refused_where_it_is_not_installed(
     assert "-m pip install 'modeler[peers]'" in ended.err
 
 
-def test_evaluate_writes_errors_and_prints_a_table(cli: Run, tmp_path: Path) -> None:
-    ended = cli("evaluate", BOX, "--out", tmp_path, "--methods", "icp,gicp", "--frames", "0:3", "--prior", "table")
+def test_evaluate_writes_errors_and_prints_a_table(cli: Run, box: Path, tmp_path: Path) -> None:
+    ended = cli("evaluate", box, "--out", tmp_path, "--methods", "icp,gicp", "--frames", "0:3", "--prior", "table")
     assert (ended.status, ended.err) == (0, "")
     rows = ended.out.splitlines()
     assert [row.split()[:5] for row in rows[1:]] == [["box", name, "1", "2", "2"] for name in ("icp", "gicp")]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_runner import Run
+from command_runner import QUICK, Run
 
 from modeler import se3
 from modeler.cli import main
@@ -20,8 +20,8 @@ from studies.formats.image_folders import small_frames
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a few small frames of the bundled box."""
     folder = tmp_path_factory.mktemp("edit")
-    write_bop(folder / "box", small_frames(5), depth_scale_mm=1.0)
-    main(["build", str(folder / "box"), "--out", str(folder / "run"), "--prior", "table", "--no-colour"])
+    write_bop(folder / "box", small_frames(4), depth_scale_mm=1.0)
+    main(["build", str(folder / "box"), "--out", str(folder / "run"), *QUICK, "--voxel-m", "0.004"])
     return folder / "run"
 
 

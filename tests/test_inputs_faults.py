@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import shutil
 from collections.abc import Callable
@@ -14,6 +12,7 @@ import pytest
 from PIL import Image
 
 from modeler.cli import main
+from modeler.sequences import open_sequence
 from studies.formats.image_folders import png_claiming, save
 
 Damage = Callable[[Path], object]
@@ -241,33 +240,36 @@ LINKS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def told(written: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What `info` says of intact sequences, by kind: intact, or the faults above would prove nothing."""
-    said = {}
-    for kind in FAULTS:
-        folder = shutil.copytree(written / kind, tmp_path_factory.mktemp(kind) / "in")
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            assert main(["info", str(folder), "--strict-paths"]) == 0
-        said[kind] = out.getvalue()
-    return said
+@pytest.mark.parametrize("kind", FAULTS)
+def test_intact_sequences_are_read_with_strict_paths(written: Path, kind: str) -> None:
+    """Or the faults above would prove nothing."""
+    assert main(["info", str(written / kind), "--strict-paths"]) == 0
 
 
 @pytest.mark.parametrize(("kind", "linked"), LINKS)
 def test_links_out_of_a_sequence_are_followed_unless_paths_are_strict(
-    written: Path, told: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, linked: str
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, linked: str
 ) -> None:
     folder = tmp_path / "in"
     shutil.copytree(written / kind, folder)
     link_out(linked, place=0)(folder)
-    assert main(["info", str(folder)]) == 0
-    assert capsys.readouterr().out == told[kind]
-    for command in ("build", "convert"):
-        assert main([command, str(folder), "--out", str(tmp_path / "run"), "--strict-paths"]) == 2
-        said = capsys.readouterr()
-        assert said.out == ""
-        assert said.err.count("\n") == 1
-        assert f"leads out of the sequence, to {tmp_path / 'outside'}" in said.err
+    sequence, intact = open_sequence(folder), open_sequence(written / kind)
+    for frame, wanted in zip(sequence, intact, strict=True):
+        for name in ("depth_m", "mask", "colour"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(wanted, name))
+        assert (frame.time_s, frame.camera) == (wanted.time_s, wanted.camera)
+    np.testing.assert_equal(sequence.truth(), intact.truth())
+    assert main(["convert", str(folder), "--out", str(tmp_path / "run"), "--strict-paths"]) == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert f"leads out of the sequence, to {tmp_path / 'outside'}" in said.err
+    assert {path.name for path in tmp_path.iterdir()} == {"in", "outside"}
+
+
+def test_strict_paths_of_a_build_make_nothing(written: Path, tmp_path: Path) -> None:
+    shutil.copytree(written / "bop", tmp_path / "in")
+    link_out(D, place=0)(tmp_path / "in")
+    assert main(["build", str(tmp_path / "in"), "--out", str(tmp_path / "run"), "--strict-paths"]) == 2
     assert {path.name for path in tmp_path.iterdir()} == {"in", "outside"}
 
 

@@ -38,7 +38,7 @@ CLOUD_METHODS: list[AbstractRegistrar] = [
 ]
 IMAGE_METHODS: list[AbstractRegistrar] = [
     registration.VisibilityRegistrar(),
-    baselines.PaperRegistrar(samples=500_000, points=25),
+    baselines.PaperRegistrar(samples=150_000, points=25),
 ]
 METHODS = CLOUD_METHODS + IMAGE_METHODS
 

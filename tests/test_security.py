@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_runner import BOX, QUICK
+from command_runner import QUICK
 from source_trees import SOURCES, nodes
 
 import modeler
@@ -65,7 +65,7 @@ def test_outputs_stay_where_they_are_asked_to_be(tmp_path: Path, capsys: pytest.
     assert open_sequence(out / "bop").name == EVIL
 
 
-@pytest.mark.parametrize("command", ["report", "batch", "register"])
+@pytest.mark.parametrize("command", ["report", "batch"])
 def test_python_files_in_the_current_folder_are_not_run(scene: Path, built: Path, tmp_path: Path, command: str) -> None:
     here = tmp_path / "here"
     here.mkdir()
@@ -74,7 +74,6 @@ def test_python_files_in_the_current_folder_are_not_run(scene: Path, built: Path
     arguments = {
         "report": ["report", built, "--out", tmp_path / "page.html"],
         "batch": ["batch", scene, "--out", tmp_path / "many", *QUICK, "--workers", "1", "--frames", ":2"],
-        "register": ["register", scene, "0", "1", *QUICK],
     }[command]
     program = f"import sys; sys.path.insert(0, {str(Path(modeler.__file__).parent.parent)!r}); "
     program += "from modeler.__main__ import main; sys.exit(main())"
@@ -93,10 +92,10 @@ def test_python_files_in_the_current_folder_are_not_run(scene: Path, built: Path
         assert "There are no pictures" not in (tmp_path / "page.html").read_text()
 
 
-def test_python_files_in_the_current_folder_are_not_run_by_the_module(tmp_path: Path) -> None:
+def test_python_files_in_the_current_folder_are_not_run_by_the_module(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "numpy.py").write_text("raise SystemExit('it is run')")
     ended = subprocess.run(
-        [sys.executable, "-m", "modeler", "info", BOX],
+        [sys.executable, "-m", "modeler", "info", str(scene)],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(Path(modeler.__file__).parent.parent)},
         capture_output=True,
