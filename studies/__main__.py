@@ -49,6 +49,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "surfacing": ("meshes of rendered shapes against the truth, by us and by Open3D", "minutes"),
     "surfacing.captures": ("surfaces and colours of held-out views of captures", "minutes"),
     "surfacing.masks_and_models": ("draw depth, mask and model of runs", "seconds"),
+    "surfacing.vertices": ("whether vertices are as far off as they state, for several depth cameras", "half an hour"),
     "symmetries": ("symmetries of shapes of known class", "minutes"),
     "tracking": ("objects found and followed with their models: on cluttered tables and in captures", "an hour"),
     "trust": ("reliability of exit status 0, with and without faults", "20 minutes a core"),

@@ -1,8 +1,9 @@
 """Fusion of posed depth views into one model of the object: point cloud and mesh."""
 
 from modeler.fusion.alignment import Match, Matcher
+from modeler.fusion.deformation import widened
 from modeler.fusion.depth_views import conditional_covariances
-from modeler.fusion.fuser import Fuser, FusionVolume, widened
+from modeler.fusion.fuser import Fuser, FusionVolume
 from modeler.fusion.incremental_tsdf import IncrementalTsdf, Preview
 from modeler.fusion.symmetries import Symmetries, SymmetryFinder
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -26,7 +26,7 @@ from modeler.fusion.meshing import DistanceField, VoxelGrid, filled, grid_around
 from modeler.fusion.support import Exposure, ViewSupport, exposure_of, view_support
 from modeler.kernels import point_clouds
 from modeler.system.concurrency import in_parallel
-from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage, Solution
+from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
 
 # Exponents of the view weights for colours: an average of views for vertices, nearly one view for textures, where an
 # average blurs. Chosen by hand.
@@ -36,7 +36,6 @@ FOLD_RINGS = 8  # rings of triangles along borders that may fold over; chosen by
 HALVES = np.array([0.36, 0.48, 0.8])  # divides directions in two halves; chosen by hand, along no axis
 MIN_NEIGHBOURS = 6  # points of the cloud with fewer in 27 cells of two voxels are outliers; a plane has some 36
 FINEST_PX = 0.01  # smallest voxel, in pixel footprints: a hundred voxels per pixel resolve nothing
-_MAX_VIEWS = 60  # by which an error of the focal length widens the surface's, spread over a run: more are redundant
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,8 @@ class Fuser:
         limit_m = 0.05 * float(np.linalg.norm(grid.shape)) * grid.voxel_m
         spread_m, sigma_m = disagreement(seen, limit_m) or (noise_m, SMOOTHED * noise_m)
         tau_m = 3.0 * grid.voxel_m + 2.0 * spread_m  # eq. 12.4
-        return FusionVolume(self, seen.carving(tau_m), grid, tau_m, grid.voxel_m + 2.0 * spread_m, sigma_m)
+        near_m = grid.voxel_m + 2.0 * spread_m
+        return FusionVolume(self, seen.carving(tau_m), grid, tau_m, near_m, sigma_m, _smoothing_m2(pairs))
 
     def voxel_side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
         """Return the side of a voxel before the memory bound is applied.
@@ -155,6 +155,8 @@ class FusionVolume:
     """Largest distance along the normal between observations of the same surface."""
     sigma_m: float
     """Standard deviation of a surface point seen head-on by one view."""
+    smoothing_m2: float = 0.0
+    """Variance of the kernel over which the views' surface is smoothed, along either axis in the surface."""
 
     def model(self, *, watertight: bool = False) -> ObjectModel:
         """Return the cloud and the mesh.
@@ -168,6 +170,7 @@ class FusionVolume:
         at_vertices = self.support(vertices, normals)
         coloured = self.views.coloured
         known = at_vertices.coloured & seen
+        flattened_m = meshing.flattened_m(vertices, triangles, normals, self.smoothing_m2)
         return ObjectModel(
             points_m=points,
             normals=point_normals,
@@ -177,7 +180,7 @@ class FusionVolume:
             vertex_normals=normals,
             vertex_colours=meshing.filled_colours(at_vertices.colours, known, vertices) if coloured else None,
             vertex_views=np.where(seen, at_vertices.views, 0),
-            vertex_sigmas_m=np.where(seen, at_vertices.sigmas_m, np.inf),
+            vertex_sigmas_m=np.where(seen, np.hypot(at_vertices.sigmas_m, flattened_m), np.inf),
         )
 
     def support(self, points_m: Array, normals: Array) -> ViewSupport:
@@ -365,6 +368,19 @@ def _some_points(pairs: list[tuple[RayImage, Array]]) -> Array:
     return np.concatenate([se3.transform(pose, view.points_m[::step]) for view, pose in one_by_one(pairs)])
 
 
+def _smoothing_m2(pairs: list[tuple[RayImage, Array]]) -> float:
+    """Return the variance in m², along either axis, of the kernel over which views are smoothed (method, eq. 12.9).
+
+    Sensors smooth surface as they smooth its noise, whose autocorrelation has the area 4π s² for a Gaussian of sd s.
+    """
+    moments_m2 = [
+        view.error_area_px * (float(np.median(view.points_m[:, 2])) / view.frame.camera.fx) ** 2
+        for view, _ in one_by_one(pairs)
+        if len(view.points_m)
+    ]
+    return float(np.median(moments_m2)) / (4.0 * np.pi)
+
+
 def _ranges_m(views: DepthViews) -> Array:
     """Return the distance (n,) of each surface point from its camera."""
     turns, shifts = views.poses[:, :, :3], views.poses[:, :, 3]
@@ -377,30 +393,3 @@ def _outliers(points_m: Array, cell_m: float) -> BoolArray:
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     shape = (np.ceil((high - low) / cell_m) + 1.0).astype(np.int64)
     return point_clouds.neighbour_counts(points_m, low, cell_m, shape) < MIN_NEIGHBOURS
-
-
-def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
-    """Return a model whose vertex uncertainty includes that of the focal length (method, eq. 12.9).
-
-    Args:
-        model: fused under the solution's poses.
-        solution: with the estimate of the focal length; without one, the model is unchanged.
-    """
-    focal, sigmas_m = solution.focal, model.vertex_sigmas_m
-    frames = [] if focal is None else [frame for frame in solution.trajectory if frame in focal.by_focal]
-    if focal is None or sigmas_m is None or not frames:
-        return model
-    vertices_m, normals = model.vertices_m, model.vertex_normals
-    total, weight = np.zeros(len(vertices_m)), np.zeros(len(vertices_m))
-    for place in np.unique(np.linspace(0, len(frames) - 1, _MAX_VIEWS).astype(np.int64)).tolist():
-        object_from_camera, by_focal = solution.trajectory[frames[place]], focal.by_focal[frames[place]]
-        points_m = se3.transform(se3.inverse(object_from_camera), vertices_m)
-        drawn = (points_m * (-1.0, -1.0, 0.0)) @ object_from_camera[:3, :3].T
-        moved = drawn + np.cross(by_focal[:3], vertices_m) + by_focal[3:]
-        rays = object_from_camera[:3, 3] - vertices_m
-        cosines = np.sum(normals * rays, axis=1) / np.linalg.norm(rays, axis=1)
-        share = np.where(cosines >= Fuser.min_cosine, cosines, 0.0)  # what contributes to the mesh
-        total += share * np.sum(normals * moved, axis=1)
-        weight += share
-    by_normal = np.divide(total, weight, out=np.zeros(len(total)), where=weight > 0.0)
-    return replace(model, vertex_sigmas_m=np.hypot(sigmas_m, focal.sigma * by_normal))

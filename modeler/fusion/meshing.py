@@ -146,6 +146,7 @@ EDGE = 4.685  # sd of the differences between neighbouring normals that make an 
 GUIDE_PASSES = 10  # of smoothing normals before edges are sought
 DIFFUSION_PASSES = 200  # of normals over neighbouring triangles: some 15 triangles far
 FITTING_PASSES = 60  # of vertices to normals
+FLATTENING_PASSES = 50  # at most, of the smoothing that shows how smoothed views flatten surface
 
 
 def without_pinches(field: DistanceField) -> DistanceField:
@@ -344,6 +345,29 @@ def without_relief(vertices_m: Array, triangles: Triangles, limits_m: Array) -> 
         return vertices_m
     normals = relief.diffused(normals, guide, areas, across, EDGE * sigma, DIFFUSION_PASSES)
     return relief.fitted(vertices_m, triangles, normals, limits_m, FITTING_PASSES)
+
+
+def flattened_m(vertices_m: Array, triangles: Triangles, normals: Array, moment_m2: float) -> Array:
+    """Return by how much (v,) in m smoothing over a surface moves it along its normals (method, eq. 12.9).
+
+    Args:
+        vertices_m: (v, 3).
+        triangles: (t, 3).
+        normals: (v, 3) unit.
+        moment_m2: variance in m² of the kernel along either axis in the surface.
+    """
+    if not len(triangles) or moment_m2 <= 0.0:
+        return np.zeros(len(vertices_m))
+    corners = vertices_m[triangles]
+    edge_m2 = float(np.mean(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2)))
+    # The mean over a ring of radius r has a variance of r²/2 along either axis; half a step towards it, r²/4.
+    passes = min(int(np.ceil(moment_m2 / (0.25 * edge_m2))), FLATTENING_PASSES)
+    reached_m2 = passes * 0.25 * edge_m2
+    step, scale = 0.5 * min(moment_m2 / reached_m2, 1.0), max(moment_m2 / reached_m2, 1.0)
+    mean, smooth = _means(_neighbours(triangles), len(vertices_m)), vertices_m.copy()
+    for _ in range(passes):
+        smooth += step * (mean @ smooth - smooth)
+    return scale * np.sum((smooth - vertices_m) * normals, axis=1)
 
 
 def _across(triangles: Triangles) -> Triangles:

@@ -10,7 +10,7 @@ asked: an incremental square root takes as long for 200 frames, and saves 20 of 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -60,6 +60,11 @@ class RelativeCovariance:
             for parent, update in zip(conditional.keys()[1:], updates, strict=True):
                 right[parent] = right[parent] - update if parent in right else -update
         return 0.5 * (covariance + covariance.T)
+
+    @property
+    def deforming(self) -> RelativeCovariance:
+        """The part due to errors that deform the model: all."""
+        return self
 
     @cached_property
     def log_determinant(self) -> float:
@@ -162,6 +167,11 @@ class SharedCovariance:
             KeyError: if a frame was not solved.
         """
         return self._widened(self.independent(target, source), target, source)
+
+    @property
+    def deforming(self) -> SharedCovariance:
+        """The part due to errors of single poses; a common one moves the surface of each view with its pose."""
+        return replace(self, focal=None, common=0.0, common_shift_m2=None)
 
     def _widened(self, independent: Array, target: int, source: int) -> Array:
         if target == source:

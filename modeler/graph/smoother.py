@@ -148,6 +148,7 @@ class Smoother:
             covariances=PoseCovariances(trajectory, functools.partial(relative_covariance, root)),
             outliers=tuple(loop.edge for loop, good in zip(loops, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
+            deforming_covariance=relative_covariance.deforming,
             edge_poses={(factor.source, factor.target): factor.pose for factor in several},
             mode_weights={(factor.source, factor.target): _weights(factor, state.weights) for factor in several},
             focal=self.focal,

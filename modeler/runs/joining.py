@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from modeler.export import RunFolder, RunMeta, locked
-from modeler.fusion import Fuser, conditional_covariances
+from modeler.fusion import Fuser, conditional_covariances, widened
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.pairs import Registrations
@@ -128,13 +128,14 @@ def _shifted(run: Reopened, offset: int, later_s: float) -> Reopened:
         {frame + offset: value for frame, value in mapping.items()}
         for mapping in (run.solution.trajectory, run.solution.covariances, run.solution.odometry)
     )
-    before = run.solution.relative_covariance
+    before, deforming = run.solution.relative_covariance, run.solution.deforming_covariance
     solution = replace(
         run.solution,
         trajectory=trajectory,
         covariances=covariances,
         odometry=odometry,
         relative_covariance=lambda target, source: before(target - offset, source - offset),
+        deforming_covariance=lambda target, source: deforming(target - offset, source - offset),
     )
     views = {frame + offset: renumbered(view, offset, later_s) for frame, view in run.views.items()}
     frames = [r | {"id": r["id"] + offset, "timestamp": r["timestamp"] + later_s} for r in run.report["frames"]]
@@ -169,6 +170,7 @@ def write_run(
     model = Fuser(voxel_m=meta.settings.get("voxel_m")).fuse(
         views, solution.trajectory, conditional_covariances(solution, graph.edges)
     )
+    model = widened(model, solution)
     names = [field.name for field in fields(FrameRecord)]
     records = [
         FrameRecord(**{name: record[name] for name in names if name in record})

@@ -200,6 +200,8 @@ class Solution:
     """Accepted edges that the optimisation left out as outliers, as the others contradict them."""
     relative_covariance: Callable[[int, int], Array] = _unsolved
     """Covariance (6, 6) of `relative(target, source)`, computed when called."""
+    deforming_covariance: Callable[[int, int], Array] = _unsolved
+    """The same without errors of the focal length, and without those that move surface and poses of all views alike."""
     edge_poses: Mapping[tuple[int, int], PoseGaussian] = field(default_factory=dict)
     """target_from_source by (source, target) of edges that entered with a pose other than their posterior's."""
     mode_weights: Mapping[tuple[int, int], Array] = field(default_factory=dict)

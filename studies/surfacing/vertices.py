@@ -1,0 +1,144 @@
+"""Whether vertices are as far off as their standard deviations say: `python -m studies surfacing.vertices`.
+
+Shapes pushed about a table for a full turn are filmed by modelled depth cameras (`calibration.depth_cameras`) whose
+given focal length has an error of 2 % standard deviation, and built with default settings. Meshes are laid on the true
+surface by a rigid motion. For each run: mean squared error of vertices over their variance, its median relative to that
+of a normal variable, the share of vertices within 1.96 standard deviations, and root mean squares of error and stated
+standard deviation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, final
+
+import numpy as np
+import open3d as o3d
+
+from modeler import se3
+from modeler.composition.options import PriorOptions
+from modeler.evaluation import align_to_model
+from modeler.export import write_atomically
+from modeler.sequences.meshes import Mesh
+from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.types import Array
+from studies.calibration.by_camera import NOMINAL, chosen
+from studies.calibration.depth_cameras import CAMERAS
+from studies.loops.cameras import Filmed
+from studies.loops.covariances import pushed
+from studies.trust.study import built
+
+_NORMAL_MEDIAN: Final = 0.4549  # of the square of a normal variable
+_PLACES: Final = 4000  # vertices by which a mesh is laid on the truth
+_ROUNDS: Final = 15
+
+
+@final
+@dataclass(frozen=True)
+class Row:
+    """A run's figures, as in the table."""
+
+    camera: str
+    shape: str
+    trusted: bool
+    nees: float
+    median: float
+    covered: float
+    error_mm: float
+    stated_mm: float
+
+
+def row(name: str, shape: str, seed: int, frames: int, step_deg: float) -> Row:
+    """Build a sequence and compare its vertices with the truth."""
+    camera = CAMERAS[name]
+    number = int(np.random.SeedSequence([seed, list(CAMERAS).index(name), *shape.encode()]).generate_state(1)[0])
+    rng = np.random.default_rng(number)
+    sequence = pushed(shape, seed, frames, step_deg)
+    view = replace(sequence.recipe.view, distance_m=float(rng.choice(camera.distances_m)))
+    rendered = RenderedSequence(replace(sequence.recipe, view=view))
+    filmed = Filmed(rendered, camera, float(np.exp(rng.normal(0.0, NOMINAL))), number)
+    step, report = built(filmed, PriorOptions(), seed)
+    model = step.model
+    assert model is not None
+    assert model.vertex_sigmas_m is not None
+    seen = np.isfinite(model.vertex_sigmas_m)
+    off_m = errors_m(model.vertices_m[seen], filmed.model(), align_to_model(step.solution.trajectory, filmed.truth()))
+    squares = (off_m / model.vertex_sigmas_m[seen]) ** 2
+    return Row(
+        name,
+        shape,
+        bool(report["trustworthy"]),
+        float(squares.mean()),
+        float(np.median(squares)) / _NORMAL_MEDIAN,
+        float(np.mean(squares < 1.96**2)),
+        1e3 * float(np.sqrt(np.mean(off_m**2))),
+        1e3 * float(np.sqrt(np.mean(model.vertex_sigmas_m[seen] ** 2))),
+    )
+
+
+def errors_m(vertices_m: Array, truth: Mesh, model_from_object: Array) -> Array:
+    """Return distances (v,) of vertices from a true surface on which they are laid, from a first guess, by ICP."""
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    tensor = o3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(truth.vertices_m.astype(np.float32)), tensor(truth.triangles.astype(np.uint32)))
+    some_m = np.random.default_rng(0).permutation(vertices_m)[:_PLACES]
+    for _ in range(_ROUNDS):
+        points_m = se3.transform(model_from_object, some_m)
+        nearest = scene.compute_closest_points(tensor(points_m.astype(np.float32)), nthreads=1)
+        normals = nearest["primitive_normals"].numpy().astype(np.float64)
+        gap_m = np.sum((nearest["points"].numpy() - points_m) * normals, axis=1)
+        kept = np.abs(gap_m) < 4.0 * np.median(np.abs(gap_m))
+        centre_m = points_m.mean(axis=0)
+        rows = np.concatenate([np.cross(points_m - centre_m, normals), normals], axis=1)
+        xi = np.linalg.lstsq(rows[kept], gap_m[kept], rcond=None)[0]
+        model_from_object = se3.translation(centre_m) @ se3.exp(xi) @ se3.translation(-centre_m) @ model_from_object
+    laid_m = se3.transform(model_from_object, vertices_m)
+    return scene.compute_distance(tensor(laid_m.astype(np.float32)), nthreads=1).numpy().astype(np.float64)
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return means over the shapes of each camera as a Markdown table; of the normalised error also its range."""
+    lines = ["| | shapes | NEES, mean (range) | median | within 1.96 sd | error, stated |", "|---" * 6 + "|"]
+    for name in dict.fromkeys(one.camera for one in rows):
+        some = [one for one in rows if one.camera == name]
+        nees, median, covered, error_mm, stated_mm = np.mean(
+            [[one.nees, one.median, one.covered, one.error_mm, one.stated_mm] for one in some], axis=0
+        )
+        least, most = min(one.nees for one in some), max(one.nees for one in some)
+        lines.append(
+            f"| {name} | {len(some)} | {nees:.2f} ({least:.1f} to {most:.1f}) | {median:.2f} | {covered:.0%} | "
+            f"{error_mm:.2f}, {stated_mm:.2f} mm |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m studies surfacing.vertices", description=__doc__)
+    parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
+    parser.add_argument("--per-class", type=int, default=1, metavar="N", help="shapes of each class of symmetry")
+    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=list(CAMERAS))
+    parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these")
+    parser.add_argument("--seed", type=int, default=0, help="of poses, noise and registration")
+    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--step-deg", type=float, default=24.0, help="mean turn from frame to frame")
+    parser.add_argument("--out", type=Path, default=Path("runs/vertices.json"), help="file of the results")
+    options = parser.parse_args(arguments)
+    rows = []
+    for name in options.cameras:
+        for shape in options.shapes or [one.recipe for one in chosen(options.half, options.per_class)]:
+            rows.append(row(name, shape, options.seed, options.frames, options.step_deg))
+            print(rows[-1], file=sys.stderr, flush=True)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(options.out, json.dumps([vars(one) for one in rows], indent=1) + "\n")
+    print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
