@@ -1,9 +1,11 @@
 """Objects found in rendered frames with their model, and followed: errors, covariances, and what is not there."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -254,6 +256,28 @@ def test_meshes_of_all_formats_are_read_in_their_unit(suffix: str, tmp_path: Pat
     assert np.allclose(np.ptp(known_object(path).model.vertices_m, axis=0), [100.0, 60.0, 40.0])
     (tmp_path / "models_info.json").write_text("{}")
     assert np.allclose(np.ptp(known_object(path).model.vertices_m, axis=0), [0.1, 0.06, 0.04])
+
+
+def test_symmetries_of_bop_are_read_beside_a_model(tmp_path: Path) -> None:
+    path, turn = tmp_path / "obj_000007.ply", np.diag([-1.0, -1.0, 1.0, 1.0])
+    turn[0, 3] = 20.0
+    trimesh.creation.box((100.0, 60.0, 40.0)).export(path)
+    entry: dict[str, Any] = {
+        "symmetries_discrete": [turn.ravel().tolist()],
+        "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [10, 0, 0]}],
+    }
+    info = path.with_name("models_info.json")
+    info.write_text(json.dumps({"7": entry}))
+    found = known_object(path).symmetries
+    assert found is not None
+    assert np.allclose(found.discrete[0][:3, 3], [0.02, 0.0, 0.0])
+    assert np.allclose(found.continuous[0].direction, [0.0, 0.0, 1.0])
+    assert np.allclose(found.continuous[0].point_m, [0.01, 0.0, 0.0])
+    info.write_text(json.dumps({"7": {}}))
+    assert known_object(path).symmetries is None
+    info.write_text(json.dumps({"7": {"symmetries_discrete": [[1.0, 2.0]]}}))
+    with pytest.raises(InputError, match="symmetries of object 7"):
+        known_object(path)
 
 
 @pytest.mark.parametrize("name", ["box.obj", "box.stl", "box.ply", "box.xyz"])

@@ -128,6 +128,7 @@ class Track:
             depth_scale_sigma=0.0 if thing.focal is None else thing.focal.depth_scale_sigma,
             segmenter=parts.segmenter,
             scene=scene,
+            known_symmetries=thing.symmetries,
             seed=self.seed,
         )
 

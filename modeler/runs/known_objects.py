@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, final
@@ -11,8 +12,9 @@ import numpy as np
 
 from modeler.export import RunFolder, read_model
 from modeler.export.bop import MODELS_INFO
+from modeler.fusion.symmetries import Axis, Symmetries
 from modeler.sequences import AbstractSequence, FocalFactor, RefocusedSequence
-from modeler.system.regular_files import read_regular
+from modeler.system.regular_files import read_json, read_regular
 from modeler.tracking.tracker import UNITS_M
 from modeler.types import InputError, ObjectModel
 
@@ -29,6 +31,8 @@ class KnownObject:
     """In m, in the frame of its file, or of `model.ply` of its run."""
     focal: FocalFactor | None = None
     """What the run that made the model found out about its camera."""
+    symmetries: Symmetries | None = None
+    """Those that the model's entry in BOP's `models_info.json` names; None: none are named."""
 
     def seen_by(self, sequence: AbstractSequence) -> AbstractSequence:
         """Return a sequence with the focal length that the model was made with, if it is of the same camera.
@@ -62,7 +66,42 @@ def known_object(path: str | Path, unit: Unit | None = None) -> KnownObject:
     scale_m = UNITS_M[unit or ("mm" if of_bop else "m")]
     model = read_model(path) if path.suffix.lower() == ".ply" else _read(path)
     sigmas_m = None if model.vertex_sigmas_m is None else scale_m * model.vertex_sigmas_m
-    return KnownObject(replace(model, vertices_m=scale_m * model.vertices_m, vertex_sigmas_m=sigmas_m))
+    return KnownObject(
+        replace(model, vertices_m=scale_m * model.vertices_m, vertex_sigmas_m=sigmas_m),
+        symmetries=_of_bop(path, scale_m) if of_bop else None,
+    )
+
+
+def _of_bop(path: Path, scale_m: float) -> Symmetries | None:
+    """Return the symmetries that the entry of a model in BOP's `models_info.json` names; None where it names none.
+
+    Raises:
+        InputError: if they are not in BOP's format.
+    """
+    info, digits = path.with_name(MODELS_INFO), re.search(r"(\d+)$", path.stem)
+    entries = read_json(info)
+    number = str(int(digits.group(1))) if digits else "1"
+    try:
+        entry = entries.get(number, {})
+        turns = np.asarray(entry.get("symmetries_discrete", []), np.float64).reshape(-1, 4, 4)
+        axes = [
+            (np.asarray(one["axis"], np.float64).reshape(3), np.asarray(one["offset"], np.float64).reshape(3))
+            for one in entry.get("symmetries_continuous", [])
+        ]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        turns, axes = np.zeros((1, 4, 4)), []
+    rotations = turns[:, :3, :3]
+    if not (
+        np.allclose(rotations @ np.swapaxes(rotations, 1, 2), np.eye(3), atol=1e-3)
+        and np.isfinite(turns).all()
+        and all(np.isfinite(point).all() and 0.0 < np.linalg.norm(direction) < np.inf for direction, point in axes)
+    ):
+        raise InputError(f"{info}: the symmetries of object {number} are not as BOP has them; correct or remove them")
+    if not len(turns) and not axes:
+        return None
+    turns[:, :3, 3] *= scale_m
+    named = [Axis(direction / np.linalg.norm(direction), scale_m * point) for direction, point in axes]
+    return Symmetries(0.0, tuple(turns), tuple(named))
 
 
 def _focal(camera: dict[str, Any]) -> FocalFactor | None:

@@ -138,11 +138,12 @@ class ViewpointSearch:
         """Return camera_from_model (k, 4, 4) after descent from the best turns, and log-likelihoods (k,)."""
         pair = self.coarse.between(view, seen, rng)
         axis = seen.centroid_m / np.linalg.norm(seen.centroid_m)
-        angles = np.arange(self.turns) * 2.0 * np.pi / self.turns
-        starts = np.broadcast_to(np.eye(4), (self.turns, 4, 4)).copy()
+        angles, places = np.arange(self.turns) * 2.0 * np.pi / self.turns, _centroids(seen)
+        starts = np.broadcast_to(np.eye(4), (len(places), self.turns, 4, 4)).copy()
         facing = _aligned(view.centroid_m / np.linalg.norm(view.centroid_m), axis)[:3, :3]
-        starts[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * axis).as_matrix() @ facing
-        starts[:, :3, 3] = seen.centroid_m - starts[:, :3, :3] @ view.centroid_m
+        starts[..., :3, :3] = Rotation.from_rotvec(angles[:, None] * axis).as_matrix() @ facing
+        starts[..., :3, 3] = places[:, None] - starts[..., :3, :3] @ view.centroid_m
+        starts = starts.reshape(-1, 4, 4)
         scores = pair.tempered(starts, 2.0 * self.search.blurs_m(pair)[0], stride=_STRIDE)
         return self._descended(pair, starts[np.argsort(-scores, kind="stable")[: self.descended]], camera_from_model)
 
@@ -153,6 +154,18 @@ class ViewpointSearch:
         for blur_m in self.search.blurs_m(pair):
             poses = pair.descend(poses, blur_m, regulariser, steps=self.search.steps)
         return se3.inverse(poses) @ camera_from_model, pair.tempered(poses, self.search.fine_m(pair))
+
+
+def _centroids(seen: RayImage) -> Array:
+    """Return the centroids (5, 3) of a view of a model, and of its halves along the axes of its image.
+
+    Of an object that is partly hidden, one of these is about where the centroid of the rest is.
+    """
+    halves = [seen.centroid_m]
+    for axis in np.linalg.svd(seen.points_m - seen.centroid_m, full_matrices=False)[2][:2]:
+        side = (seen.points_m - seen.centroid_m) @ axis > 0.0
+        halves += [seen.points_m[side].mean(axis=0), seen.points_m[~side].mean(axis=0)]
+    return np.array(halves)
 
 
 def _here_and_centred(view: RayImage, seen: RayImage) -> Array:

@@ -53,7 +53,10 @@ UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _SIGMA_RAD, _SIGMA = 0.12, 0.15  # of a pose found by the search: rotation, and shift in units of the object's size
 _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames before
 _MOST_STEPS = 3.0  # over which a velocity is extrapolated
-_OVERLAP, _SHOWN = 0.6, 0.3  # least, with any rotation: a small part of a model looks like many things
+_OVERLAP = 0.6  # least, with any rotation
+# Least number of patches of the frame or share of the model that match: of other shapes, up to 13.6 do where all fits.
+_PATCHES, _SHOWN = 14.0, 0.3
+_PER_PATCH = np.log(2.0)  # nats for each patch of a candidate: other surface matches by chance every second time
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
 _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
 _MOST_TRIED = 3  # of the segments of a frame, the likeliest
@@ -120,6 +123,8 @@ class Tracker:
     """Finds what may be the object where no mask says, and the scene does not show it."""
     scene: Scene = field(default_factory=Scene)
     """As the segmenter estimated it from a sequence, if it is known beforehand."""
+    known_symmetries: Symmetries | None = None
+    """Rotations of the model onto itself, if they are known; otherwise they are looked for."""
     seed: int = 0
     """Each frame has its own random generator, seeded with this and the frame's number."""
     newest: list[Tracked] = field(default_factory=list, init=False, repr=False)
@@ -144,6 +149,8 @@ class Tracker:
     @cached_property
     def symmetries(self) -> Symmetries:
         """Rotations that map the model onto itself; looked for once a pose is uncertain, as that takes seconds."""
+        if self.known_symmetries is not None:
+            return self.known_symmetries
         return _SYMMETRIES.find_in(self.model, np.array([0.0, 0.0, 1.0]))
 
     def update(self, frame: Frame) -> Tracked:
@@ -169,22 +176,20 @@ class Tracker:
         nothing = Tracked(frame.index, frame.time_s, "too few points", reason="no segment is large enough")
         segmented = frame.mask is not None or self.scene.still or self.scene.alone
         if segmented:
-            view = self._view(frame)
+            view = self._view(frame, support=not self._follows or self.prior is not None)
             followed = None if view is None else self._followed(view, rng)
             if followed is not None:
                 return followed
-            view = self._view(frame, anywhere=True) if self._follows else view
+            view = self._view(frame, support=True) if self._follows else view
             if view is not None or frame.mask is not None:
                 return nothing if view is None else self._found([view], rng)
         clear = frame.unoccluded
         if self._follows:
-            view = self._view(replace(clear, mask=self.finder.near(clear, self._predicted(frame), self.renderer)))
+            view = self._guessed(clear, self.finder.near(clear, self._predicted(frame), self.renderer))
             followed = None if view is None else self._followed(view, rng)
             if followed is not None:
                 return followed
-        views = [
-            self._view(replace(clear, mask=mask), anywhere=True) for mask in self.finder.masks(clear, self.renderer)
-        ]
+        views = [self._guessed(clear, mask) for mask in self.finder.masks(clear, self.renderer)]
         return self._found([view for view in views if view is not None], rng, nothing, clear)
 
     @property
@@ -192,16 +197,20 @@ class Tracker:
         """Whether the frames before say where the object is."""
         return bool(self.newest) and not self.independent
 
-    def _view(self, frame: Frame, *, anywhere: bool = False) -> RayImage | None:
+    def _guessed(self, frame: Frame, mask: BoolArray) -> RayImage | None:
+        """Return a frame with a guessed mask (h, w), prepared, without what may seem to be its support."""
+        return self._view(replace(frame, mask=mask), support=self.prior is not None)
+
+    def _view(self, frame: Frame, *, support: bool) -> RayImage | None:
         """Return a frame prepared for registration; None if too little of an object is seen.
 
         Args:
             frame: with a mask, or one that the scene tells.
-            anywhere: whether the object is looked for with any rotation; else, where it is followed by its velocity, a
-                mask is taken as it is, without the support, which takes a quarter of the time.
+            support: whether the plane is looked for on which the object in a mask stands: a quarter of the time of an
+                object that is followed, whose mask is then taken as it is.
         """
         mask, plane = frame.mask, None
-        if anywhere or mask is None or not self._follows or self.prior is not None:
+        if mask is None or support:
             segmented = self.segmenter.segment(frame, self.scene)
             if segmented.outcome not in SEGMENTED:
                 return None
@@ -282,7 +291,7 @@ class Tracker:
             self._check_size(view)
             distance_m = float(np.linalg.norm(view.centroid_m)) + 0.5 * self.renderer.radius_m
             poses, scores = self.search.roughly(self._viewpoints(view, distance_m), view, rng)
-            rough += [(scores[0], (poses, scores), view)] if len(poses) else []
+            rough += [(scores[0] + _PER_PATCH * view.patches, (poses, scores), view)] if len(poses) else []
         rough.sort(key=lambda one: -one[0])
         absent = nothing
         for _, poses, view in rough[:_MOST_TRIED]:
@@ -311,16 +320,18 @@ class Tracker:
             best, about = registered[0]
             if unmasked is not None and best.usable and best.overlap > _OVERLAP:
                 reached = se3.inverse(best.pose.mean) @ about
-                better = self._view(replace(unmasked, mask=self.finder.near(unmasked, reached, self.renderer)))
+                better = self._guessed(unmasked, self.finder.near(unmasked, reached, self.renderer))
                 if better is not None:
                     return self._in_view(better, (reached[None], np.full(1, -np.inf)), rng)
             reason = "the images contradict the likeliest pose" if best.usable else best.outcome.label
             return replace(absent, overlap=best.overlap, reason=reason)
         pairs = [self._pair(view, se3.inverse(posterior.pose.mean) @ pose, rng) for posterior, pose in convincing]
-        shown = [_share_shown(pair) for pair in pairs]
-        kept = [k for k, (posterior, _) in enumerate(convincing) if posterior.overlap > _OVERLAP and shown[k] > _SHOWN]
+        enough = [one.overlap > _OVERLAP and _enough(pair) for (one, _), pair in zip(convincing, pairs, strict=True)]
+        # Again: the view from beside a pose, with which it was registered, shows less of what should be seen.
+        fits = [pair.fits(np.eye(4), self.registrar.search.fine_m(pair)) for pair in pairs]
+        kept = [k for k in range(len(pairs)) if enough[k] and fits[k]]
         if not kept:
-            reason = f"only {100.0 * max(shown):.0f} % of the model's surface matches"
+            reason = "the images contradict all poses" if any(enough) else "too little surface matches"
             return replace(absent, overlap=convincing[0][0].overlap, reason=reason)
         weights = self._weights([pairs[k] for k in kept], view)
         order = np.argsort(-weights, kind="stable")
@@ -465,9 +476,13 @@ def _near(view: RayImage, sigma_rad: float, sigma: float) -> KernelMixture:
     )
 
 
-def _share_shown(pair: PairLikelihood) -> float:
-    """Return the share of the model's surface that faces the camera and matches, with the model in the pose."""
-    return float(np.mean(pair.backward.classify(se3.rows(np.eye(4))) == point_likelihood.MATCHED))
+def _enough(pair: PairLikelihood) -> bool:
+    """Return whether enough of a frame's surface, or of the model's that faces the camera, matches in the pose."""
+    frames, models = (
+        float(np.mean(side.classify(se3.rows(np.eye(4))) == point_likelihood.MATCHED))
+        for side in (pair.forward, pair.backward)
+    )
+    return pair.backward.image.patches * frames > _PATCHES or models > _SHOWN
 
 
 def _of_model(motion: PoseGaussian, rendered: Array) -> PoseGaussian:

@@ -1,12 +1,13 @@
 """Find objects with models: rendered on a cluttered table, followed, and in captures of which half made the model.
 
-    python -m studies tracking --jobs 2                                        # rendered shapes, an hour
+    python -m studies tracking --half held-out --jobs 16 --seconds 400         # rendered shapes
     python -m studies tracking --jobs 16 --captures ../shared/data/* --record  # and captures, half an hour on 16 cores
 
 On the rendered table and in captures each frame stands for itself: any rotation, anywhere in view. On the table no mask
-is given, 0 to 60 % of the object are hidden, and every fourth scene is without it. Of a capture, models of the even and
-of the odd frames are sought in the other half, where the poses of the whole run are the reference, and in frames of the
-other captures, where it is absent. A pose is right below 5° and 5 mm, or below a tenth of the diameter in BOP's MSSD;
+is given, six cameras see it, 0 to 60 % of the object are hidden, and every fourth scene is without it. A model built of
+half of the frames of a turned shape is sought in the others. Of a capture, models of the even and of the odd frames are
+sought in the other half, where the poses of the whole run are the reference, and in frames of the other captures, where
+it is absent. A pose is right below 5° and 5 mm, or below a tenth of the diameter in BOP's MSSD;
 turns of a symmetric model are allowed in both.
 
 Baselines get the mask, on the table the true one: point pair features (with OpenCV, if it is installed) and FPFH with
@@ -20,6 +21,7 @@ import argparse
 import json
 import multiprocessing
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
@@ -34,7 +36,7 @@ from scipy import stats
 from modeler.sequences import open_sequence
 from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
-from studies.tracking.trials import MSSD, OURS, PARTS, Trial, built, followed, in_capture, on_table, shapes
+from studies.tracking.trials import MSSD, OURS, PARTS, Trial, built, followed, in_capture, on_table, shapes, turned
 
 T = TypeVar("T")
 _ABSENT_FRAMES = 3  # of each other capture
@@ -48,13 +50,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--captures", nargs="*", type=Path, default=(), metavar="SEQUENCE", help="recordings")
     parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
-    parser.add_argument("--shapes", type=int, default=8, metavar="N", help="rendered shapes, in all")
-    parser.add_argument("--scenes", type=int, default=8, metavar="N", help="scenes of each")
+    parser.add_argument("--shapes", type=int, default=24, metavar="N", help="rendered shapes, in all")
+    parser.add_argument("--scenes", type=int, default=24, metavar="N", help="scenes of each")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes, each with one thread")
+    parser.add_argument("--seconds", type=float, default=np.inf, metavar="S", help="begin nothing after as long")
     parser.add_argument("--out", type=Path, default=Path("runs/tracking"), metavar="DIR", help="runs and results")
     parser.add_argument("--record", action="store_true", help="put the figures into their file")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    until_s = time.monotonic() + options.seconds
     captures = [path for path in options.captures if _is_sequence(path)]
     for _ in _done(
         [partial(built, path, part, options.out) for path in captures for part in (*PARTS, "whole")], options.jobs
@@ -62,21 +66,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("built", file=sys.stderr)
     names = tuple(shapes(options.half, options.shapes))
     work: list[Callable[[], list[Trial]]] = [
-        partial(on_table, name, names, range(_SEED * number, _SEED * number + options.scenes))
-        for number, name in enumerate(names)
-    ]
-    work += [partial(followed, name) for name in names]
-    work += [
         partial(in_capture, path, part, other, options.out, _ABSENT_FRAMES)
         for path in captures
         for part in PARTS
         for other in captures
     ]
+    work += [
+        partial(on_table, name, names, range(_SEED * number + some, _SEED * number + min(some + 4, options.scenes)))
+        for some in range(0, options.scenes, 4)
+        for number, name in enumerate(names)
+    ]
+    each = [one for name in names for one in (partial(turned, name, options.out), partial(followed, name))]
+    after = len(work) // 2  # those that end early have half of the table, and all else
+    work[after:after] = each
     path = options.out / "trials.jsonl"
     trials = [Trial(**json.loads(line)) for line in earlier_results(path)]
     if not trials:
         with path.open("w") as file:
-            for some in _done(work, options.jobs):
+            for some in _done(work, options.jobs, until_s):
                 trials += some
                 file.writelines(json.dumps(asdict(trial)) + "\n" for trial in some)
                 file.flush()
@@ -94,11 +101,17 @@ def _is_sequence(path: Path) -> bool:
     return path.is_dir() and len(open_sequence(path).indices) > 1
 
 
-def _done(work: Sequence[Callable[[], T]], jobs: int) -> Iterator[T]:
-    """Yield the results of work as they come; those that fail are said on stderr."""
+def _done(work: Sequence[Callable[[], T]], jobs: int, until_s: float = np.inf) -> Iterator[T]:
+    """Yield the results of work as they come, of what begins until a time; those that fail are said on stderr."""
     context = multiprocessing.get_context("spawn")  # kernels' threads do not survive a fork
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=numba.set_num_threads, initargs=(1,)) as pool:
-        for future in as_completed([pool.submit(one) for one in work]):
+        futures = [pool.submit(one) for one in work]
+        for future in as_completed(futures):
+            if time.monotonic() > until_s:
+                for one in futures:
+                    one.cancel()
+            if future.cancelled():
+                continue
             try:
                 yield future.result()
             except Exception as error:
@@ -115,6 +128,8 @@ def table(trials: Sequence[Trial]) -> list[list[str | float]]:
         "table, at least 70 % visible": [t for t in table if t.visible >= 0.7],
         "table, 40 to 70 % visible": [t for t in table if 0.4 <= t.visible < 0.7],
         "table, absent": [t for t in table if t.visible == 0.0],
+        "turned, model built": [t for t in trials if t.group == "turned, model trusted"],
+        "turned, model not trusted": [t for t in trials if t.group == "turned, model not trusted"],
         "followed": [t for t in trials if t.group == "followed"],
         "captures, other half": [t for t in trusted if t.visible > 0.0],
         "captures, absent": [t for t in trusted if t.visible == 0.0],

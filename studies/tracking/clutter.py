@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final, final
 
@@ -25,6 +25,12 @@ _ASIDE = np.linspace(0.0, 1.5, 16)  # places of what hides the object: from befo
 _NEARER = 0.7  # share of the object's distance at which it is held
 VIEW: Final = Viewpoint()
 """The camera, 35° above a table 0.8 m away."""
+VIEWS: Final = tuple(
+    replace(VIEW, distance_m=distance_m, elevation_deg=elevation_deg)
+    for elevation_deg in (35.0, 55.0)
+    for distance_m in (0.8, 0.6, 1.1)
+)
+"""The six cameras of the study."""
 
 
 @final

@@ -12,6 +12,7 @@ import numpy as np
 
 import modeler
 from modeler import se3
+from modeler.baselines import IcpRegistrar
 from modeler.composition import compose
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, poses_of
@@ -26,7 +27,7 @@ from modeler.views import Sensor
 from studies.calibration.specimens import SPECIMENS, Half, load_specimen
 from studies.calibration.study import Condition, staged
 from studies.tracking.baselines import ModelCloud, methods
-from studies.tracking.clutter import VIEW, model_of, mssd_m, noise, scene
+from studies.tracking.clutter import VIEWS, model_of, mssd_m, noise, scene
 
 OURS: Final = "modeler track"
 DEG, M, MSSD = 5.0, 0.005, 0.1
@@ -35,6 +36,7 @@ HIDDEN: Final = 0.6
 """Largest share of the object that is hidden, on purpose."""
 _SMALL_M = 0.35  # of shapes that fit on the table together
 _AWAY_DEG, _AWAY_M = 15.0, 0.01  # of the last pose from the true one, where frames stand for themselves
+_TURNS, _TURN_DEG = 28, 12.5  # frames of a shape of which half make a model, and its turn in each
 _FOLLOWED, _STEP_DEG = 30, 6.0  # frames of an object that is followed, and its turn in each
 Part = Literal["even", "odd"]
 PARTS: Final[dict[Part, int]] = {"even": 0, "odd": 1}
@@ -112,22 +114,50 @@ def on_table(name: str, names: tuple[str, ...], scenes: range) -> list[Trial]:
         names: of the shapes that may be around it.
         scenes: seeds.
     """
-    sensor = Sensor(noise(VIEW.distance_m, VIEW))
-    sought = Sought(model_of(name), Tracker(model_of(name), sensor, independent=True))
-    thing, found = sought.thing, list[Trial]()
+    found = list[Trial]()
     for seed in scenes:
-        rng, absent = np.random.default_rng(seed), seed % 4 == 3
+        view, absent = VIEWS[seed // 4 % len(VIEWS)], seed % 4 == 3
+        rng, sensor = np.random.default_rng(seed), Sensor(noise(view.distance_m, view))
+        sought = Sought(model_of(name), Tracker(model_of(name), sensor, independent=True))
+        thing = sought.thing
         others = tuple(str(one) for one in rng.choice([one for one in names if one != name], 3, replace=False))
-        shown = scene(None if absent else name, others, seed, hidden=HIDDEN * float(rng.uniform()))
+        shown = scene(None if absent else name, others, seed, hidden=HIDDEN * float(rng.uniform()), view=view)
         where, truth = ("table", f"{name} {seed}"), shown.camera_from_model
         found.append(_trial(where, sought, shown.frame, truth, shown.visible))
         if truth is None:
             continue
         masked = replace(shown.frame, mask=shown.mask)
-        if (view := prepare(masked, Segmented(), sought.tracker.segmenter, sensor).view) is not None:
-            found += _beside(where, (sought, thing), view, truth, shown.visible)
-            found += _beside(where, (sought, thing), view, truth, shown.visible, last=_away(truth, sought, rng))
+        if (seen := prepare(masked, Segmented(), sought.tracker.segmenter, sensor).view) is not None:
+            found += _beside(where, (sought, thing), seen, truth, shown.visible)
+            found += _beside(where, (sought, thing), seen, truth, shown.visible, last=_away(truth, sought, rng))
     return found
+
+
+def turned(name: str, out: Path) -> list[Trial]:
+    """Return trials of a turned shape: the model that its even frames make, sought in each odd one.
+
+    The truth is the pose in which the model's surface fits the true one best.
+
+    Args:
+        name: of the shape.
+        out: where the run is written.
+    """
+    sequence = RenderedSequence(staged(load_specimen(name), Condition(step_deg=_TURN_DEG), frames=_TURNS, seed=2))
+    run, mesh, truth = out / f"turned-{name}", sequence.model(), sequence.truth()
+    modeler.build(sequence.select(every=2), run, overwrite=True)
+    first, thing = min(poses_of(RunFolder(run).result())), known_object(run)
+    sensor, scale = Sensor(sequence.sensor()), 0.0 if thing.focal is None else thing.focal.depth_scale_sigma
+    sought = Sought(thing.model, Tracker(thing.model, sensor, independent=True, depth_scale_sigma=scale))
+    exact = ModelCloud(_exact(mesh.vertices_m, mesh.triangles), sought.diameter_m)
+    fit = IcpRegistrar().refine(sought.thing.cloud, exact.cloud, se3.inverse(truth[first]))
+    if fit is None:
+        return []
+    where = "turned, model " + ("trusted" if RunFolder(run).result()["trustworthy"] else "not trusted")
+    return [
+        _trial((where, f"{name} {index}"), sought, thing.seen_by(sequence).frame(index),
+               truth[index] @ fit.target_from_source, 1.0)
+        for index in sequence.indices[1::2]
+    ]  # fmt: skip
 
 
 def followed(name: str) -> list[Trial]:
