@@ -127,3 +127,23 @@ def test_steps_about_no_common_axis_are_solved_without_one() -> None:
         assert (state.about_axis(prior) is not None) is fits
         assert replace(state, spans=(edges[0],)).about_axis(prior) is None
         assert state.about_axis(GeneralPrior()) is None
+
+
+def test_an_edge_to_another_view_that_contradicts_what_was_told_does_not_place_a_view() -> None:
+    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
+    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(4)}
+    placed = {k: poses[0] @ se3.inverse(poses[k]) for k in range(3)}
+    state = State(smoother=Smoother(solution=Solution(placed)), views=views, places={k: k for k in views})
+
+    def found(prior: TurntablePrior | GeneralPrior, target: int, true: int) -> bool:
+        """Return whether frame 3 may be placed by a match with a view that is the true one with another."""
+        search = Search(state, prior, Closer(), views[3], 2)
+        motion = PoseGaussian(poses[0] @ se3.inverse(poses[true]), 1e-6 * np.eye(6))
+        search.found[target] = Posterior(3, target, motion, Outcome.CONVERGED, overlap=0.9)
+        return bool(search.candidates)
+
+    told = TurntablePrior(24.0, 1.0)
+    assert found(told, 0, 3)
+    assert not found(told, 0, 1)  # three steps were told, and one is found
+    assert found(told, 2, 3)  # the previous view's registration holds what was told
+    assert found(GeneralPrior(limits_assumed=True), 0, 1)

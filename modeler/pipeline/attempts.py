@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final, Literal, final
 
 import numpy as np
+from scipy.special import chdtri
 
 from modeler import se3
 from modeler.closure import Closer
@@ -36,6 +37,7 @@ from modeler.types import (
     are_separate,
     pooled,
 )
+from modeler.verdict.evidence import TAIL, distance_nats
 
 FULL: Final = 1.0
 """Effort of a registration that may become an edge."""
@@ -128,6 +130,26 @@ class Search:
     def posteriors(self) -> tuple[Posterior, ...]:
         """The registrations so far, in order."""
         return tuple(self.found.values())
+
+    @property
+    def candidates(self) -> tuple[Posterior, ...]:
+        """The registrations that may place the view: without those of other views that contradict what was told.
+
+        What was told of the motion is not part of them. So they would be the only evidence for themselves.
+        """
+        first = self.found.get(self.first)
+        return tuple(found for found in self.posteriors if found is first or not self._told_otherwise(found))
+
+    def _told_otherwise(self, posterior: Posterior) -> bool:
+        """Return whether a registration contradicts a prior that was told, as the verdict would say (13.2)."""
+        if not posterior.usable or self.prior.unlimited() is not None:
+            return False
+        prior, steps = self.prior.following(posterior.target), self.state.steps(self.view.index, posterior.target)
+        with suppress(InputError):
+            density = prior.relaxed(max(steps, 2)).between(self.view, self.state.views[posterior.target])
+            means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
+            return distance_nats(density, float(density.log_prior(means).max())) > 0.5 * float(chdtri(6, TAIL))
+        return False
 
     @property
     def _probably_hidden(self) -> bool:

@@ -80,7 +80,7 @@ class Tracker:
                 yield Searching(view.index)
             search.add(attempt, self._registered(attempt))
             effort = attempt.effort
-            placement = self.closer.placement(search.posteriors, self.state.map_view, steps=search.steps)
+            placement = self.closer.placement(search.candidates, self.state.map_view, steps=search.steps)
             if placement.base is not None and placement.base.convincing and effort == FULL:
                 break
         return search.posteriors, placement

@@ -132,11 +132,11 @@ def prior_distances(
             means = np.concatenate([means, solution.relative(edge.target, edge.source)[None]])
         here = float(density.log_prior(means).max())
         if np.isfinite(here):  # not at a limit of the search, where the posterior is cut off
-            found.append((edge, _distance_nats(density, here)))
+            found.append((edge, distance_nats(density, here)))
     return found
 
 
-def _distance_nats(density: AbstractPoseDensity, here: float) -> float:
+def distance_nats(density: AbstractPoseDensity, here: float) -> float:
     """Return how far from the mode of a density, in nats of a Gaussian, a pose of log prior `here` is.
 
     For a Gaussian it is the difference of the logs. For densities with a wide part of little mass, such as a possible
