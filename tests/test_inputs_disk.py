@@ -19,6 +19,7 @@ from command_runner import QUICK
 from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.sequences import open_sequence, write_bop
+from modeler.types import InputError
 from studies.formats.image_folders import small_frames
 
 
@@ -121,6 +122,17 @@ def closed() -> Iterator[Path]:
             os.seteuid(65534)
         yield Path(place)
         os.seteuid(user)
+
+
+def test_that_a_run_is_closed_to_others_is_said(closed: Path) -> None:
+    user = os.geteuid()
+    os.seteuid(os.getuid())
+    os.chmod(closed, 0o600)
+    os.seteuid(user)
+    with pytest.raises(InputError, match="Permission denied"):
+        RunFolder(closed).report()
+    os.seteuid(os.getuid())
+    os.chmod(closed, 0o700)
 
 
 @pytest.mark.parametrize("command", ["build", "convert", "export", "evaluate", "poses"])

@@ -138,6 +138,29 @@ def test_a_right_alignment_does_not_pay_for_poses_that_err_within_segments(bend:
     assert Joiner().likelihoods(*parts, np.eye(4)[None])[0] > 0.0
 
 
+@pytest.mark.parametrize(("first", "last"), [(range(9), range(6, 15)), (range(3), range(4, 7))])
+def test_sessions_that_share_few_views_are_held_against_pairs_that_share_as_little(first: range, last: range) -> None:
+    """Print that agrees gains much in near views; views of two sessions are farther apart than those of one."""
+    rng, poses, sensor = np.random.default_rng(0), tabletop.turntable(16), Sensor(SensorNoise(1e-3, 1e-3))
+    waves, phases = rng.normal(scale=300.0, size=(20, 3)), rng.uniform(0.0, 2.0 * np.pi, 20)
+    views = {}
+    for k, one in tabletop.views(tabletop.BRICK, poses).items():
+        grey = np.full(one.frame.depth_m.shape, 60.0)
+        on_body_m = se3.transform(se3.inverse(poses[k]), one.points_m)
+        grey[tuple(one.pixels.T)] = 120.0 + 12.0 * np.sum(np.sin(on_body_m @ waves.T + phases), axis=1)
+        grey = np.clip(grey + rng.normal(size=grey.shape), 0.0, 255.0).astype(np.uint8)
+        colour = np.ascontiguousarray(np.broadcast_to(grey[..., None], (*grey.shape, 3)))
+        views[k] = sensor.ray_image(replace(one.frame, colour=colour))
+    true = tabletop.trajectory(poses)
+    parts = (
+        Segment({k: views[k] for k in first}, Solution({k: true[k] for k in first}), ()),
+        Segment({k + 16: shifted(views[k], k + 16) for k in last}, Solution({k + 16: true[k] for k in last}), ()),
+    )
+    turns = [np.zeros(6), *np.pi * np.eye(6)[[0, 2]]]  # a brick fits its hull upside down and the other way round
+    found = [Joiner().is_consistent(*parts, Alignment(se3.exp(turn))) for turn in turns]
+    assert found == [True, False, False]
+
+
 @pytest.mark.parametrize(("sigma_deg", "accepted"), [(1.0, True), (5.0, False)])
 def test_a_rotation_that_the_alignment_alone_bounds_joins_nothing(sigma_deg: float, accepted: bool) -> None:
     """A mug whose handle is hidden: the pair would repeat whatever the alignment of the models said."""

@@ -154,8 +154,12 @@ class RunFolder:
             InputError: if there is none or it cannot be read.
         """
         path = self.path / _REPORT
-        if not os.path.lexists(path):
-            raise InputError(f"{path}: no report; give a run folder instead of {self.path}")
+        try:
+            os.lstat(path)
+        except PermissionError:
+            pass  # it may be there, and reading says why it cannot be read
+        except (OSError, ValueError):
+            raise InputError(f"{path}: no report; give a run folder instead of {self.path}") from None
         report = read_json(path)
         if not isinstance(report, dict) or report.get("schema") not in (1, 2):
             raise InputError(f"{path}: not a report of schema 1 or 2; build the run again")

@@ -121,7 +121,7 @@ class Joiner:
         return [replace(found[0], edges=tuple(map(_rejected, found[0].edges))), *found[1:]] if found else []
 
     def is_consistent(self, target: Segment, source: Segment, alignment: Alignment) -> bool:
-        """Return whether views of two segments contradict each other no more than those of one segment do.
+        """Return whether views of two segments fit each other as well as those of one segment that share as much do.
 
         The tolerance is the chance deviation of the misfits of independent measurements, as many as a pair has for each
         view of the smaller segment (method, eq. 11.2).
@@ -129,7 +129,11 @@ class Joiner:
         count = min(_MAX_VIEWS, len(target.frames), len(source.frames))
         freedom = count * self._independent(target, source)
         allowed = 0.5 * (float(chdtri(freedom, _TAIL)) - freedom) / count
-        return alignment.log_likelihood >= self._own(target, source)[0] - allowed
+        found, shared = self._across(target, source, alignment.target_from_source[None])[..., 0]
+        within, own = self._within(target, source)
+        order = np.argsort(own, kind="stable")
+        alike = np.interp(shared, [0.0, *own[order]], [0.0, *within[order]])  # without common surface nothing is gained
+        return float(np.mean(found - alike)) >= -allowed
 
     def likelihoods(self, target: Segment, source: Segment, poses: Array) -> Array:
         """Return the log-likelihoods (n,) in nats of alignments (n, 4, 4), means over pairs of views (eq. 11.1).
@@ -137,14 +141,9 @@ class Joiner:
         Poses within a segment err, too, so that right pairs of views pay, the more the more surface they share. Pairs
         that share none pay nothing: without that price an alignment would gain by sharing less.
         """
-        targets, sources = self._spread(target, _MAX_VIEWS), self._spread(source, _MAX_VIEWS)
-        found = [
-            self._nats(other, view, se3.inverse(target.solution.trajectory[t]) @ poses @ source.solution.trajectory[s])
-            for t, view in targets.items()
-            for s, other in sources.items()
-        ]
-        log_likelihood, shared = np.mean(found, axis=0)
-        return log_likelihood - self._own(target, source)[1] * shared
+        log_likelihood, shared = self._across(target, source, poses).mean(axis=1)
+        within, own = self._within(target, source).mean(axis=1)
+        return np.asarray(log_likelihood - (min(within / own, 0.0) if own > 0.0 else 0.0) * shared)
 
     def weighted(self, target: Segment, source: Segment, alignments: Sequence[Alignment]) -> list[Alignment]:
         """Return alignments with their likelihoods and probabilities, likeliest first.
@@ -263,19 +262,24 @@ class Joiner:
         found = pair.scores(poses, self._search.fine_m(pair), stride=1)
         return np.stack([pair.temper * found.surface + found.colours, found.explained])
 
-    def _own(self, *segments: Segment) -> tuple[float, float]:
-        """Return the mean log-likelihood of pairs of views within segments beyond what they pay for sharing surface.
+    def _across(self, target: Segment, source: Segment, poses: Array) -> Array:
+        """Return as `_nats` (2, m, n) the m pairs of views, one of each segment, for alignments (n, 4, 4)."""
+        targets, sources = self._spread(target, _MAX_VIEWS), self._spread(source, _MAX_VIEWS)
+        found = [
+            self._nats(other, view, se3.inverse(target.solution.trajectory[t]) @ poses @ source.solution.trajectory[s])
+            for t, view in targets.items()
+            for s, other in sources.items()
+        ]
+        return np.stack(found, axis=1)
 
-        And that price, in nats for all of the surface; at most 0.
-        """
+    def _within(self, *segments: Segment) -> Array:
+        """Return as `_nats` (2, m) the m pairs of views within segments; one of zeros if there are none."""
         own = [
             self._nats(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[:, 0]
             for views, poses in ((self._spread(one, _MAX_VIEWS), one.solution.trajectory) for one in segments)
             for t, s in itertools.combinations(views, 2)
         ]
-        log_likelihood, shared = np.mean(own, axis=0) if own else (0.0, 0.0)
-        price = min(float(log_likelihood / shared), 0.0) if shared > 0.0 else 0.0
-        return float(log_likelihood) - price * float(shared), price
+        return np.stack(own, axis=1) if own else np.zeros((2, 1))
 
     def _independent(self, target: Segment, source: Segment) -> float:
         """Return the median number of independent measurements of a pair of views, one of each segment."""
