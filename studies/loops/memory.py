@@ -4,9 +4,10 @@
 folder of images that is reused, and builds it as the command does: with stored pairs, recording and report. With
 --told-truth, ground truth replaces registration, to measure the cost of everything else. With --watch, the folder is
 written while it is built, as fast as frames are taken, and with faults: files in two halves, cut off for good, or late,
-links to nothing, intrinsics that are gone for a moment. Ctrl-C ends it with the frames so far. stdout has a line for
-every --every steps: resident memory as the system counts it (what the program allocated, and what it read of mapped
-files), and the most so far.
+links to nothing, intrinsics that are gone for a moment. With --turns, the object is there for so many turns, spread
+over all of the time, as on a stand that is watched all day. Ctrl-C ends it with the frames so far. stdout has a line
+for every --every steps: resident memory as the system counts it (what the program allocated, and what it read of
+mapped files), and the most so far.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
+from PIL import Image
 
 from modeler.cli import build, main
 from modeler.cli.console import Console
@@ -65,7 +67,7 @@ def write_repeated(folder: Path, pictures: Path, count: int, frames: int) -> Non
     (folder / "sequence.json").write_text(json.dumps(described))
 
 
-def write_slowly(folder: Path, pictures: Path, count: int, frames: int, taken: Callable[[], int]) -> None:
+def write_slowly(folder: Path, pictures: Path, count: int, frames: int, period: int, taken: Callable[[], int]) -> None:
     """Write depth, masks and intrinsics into a folder that somebody watches, with faults, and the file that ends it.
 
     Args:
@@ -73,6 +75,7 @@ def write_slowly(folder: Path, pictures: Path, count: int, frames: int, taken: C
         pictures: sequence of `count` frames, whose files are written in turn.
         count: its frames.
         frames: to write.
+        period: frames from one turn, of `count` frames, to the next; in between the object is not there.
         taken: returns the number of the newest that has been taken: those far ahead of it wait.
     """
     rng = np.random.default_rng(0)
@@ -82,14 +85,17 @@ def write_slowly(folder: Path, pictures: Path, count: int, frames: int, taken: C
     settings.write_text(json.dumps({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": camera["depth_scale"]}))
     for part in ("depth", "masks"):
         (folder / part).mkdir()
+    empty = folder.with_name(f"{folder.name}.png")
+    Image.fromarray(np.zeros((round(2 * cy) + 1, round(2 * cx) + 1), np.uint8)).save(empty)
     order = np.arange(frames)
     for place in rng.choice(max(frames - 2, 0), frames // FAULTY, replace=False):
         order[[place, place + 1]] = order[[place + 1, place]]  # comes late
     for written, number in enumerate(map(int, order)):
         while written - taken() > _AHEAD:
             time.sleep(0.02)
-        shown, name = number % count, f"{number:06d}.png"
-        os.link(pictures / "mask_visib" / f"{shown:06d}_000000.png", folder / "masks" / name)
+        shown, name = number % period % count, f"{number:06d}.png"
+        mask = pictures / "mask_visib" / f"{shown:06d}_000000.png" if number % period < count else empty
+        os.link(mask, folder / "masks" / name)
         content, path = (pictures / "depth" / f"{shown:06d}.png").read_bytes(), folder / "depth" / name
         match int(rng.integers(5 * FAULTY)) if written else -1:
             case 0:
@@ -113,7 +119,7 @@ def write_slowly(folder: Path, pictures: Path, count: int, frames: int, taken: C
 
 FAULTY: Final = 20
 """One of so many frames comes late, and as many have another fault."""
-_AHEAD: Final = 5
+_AHEAD: Final = 30  # frames: a second of a camera
 
 
 class Meter(Console):
@@ -159,19 +165,21 @@ def run() -> int:
     parser.add_argument("--width", type=int, default=320, help="of the images in pixels, whose height is 3/4 of it")
     parser.add_argument("--out", type=Path, default=Path("runs/memory"), help="folder of the sequence and the run")
     parser.add_argument("--watch", action="store_true", help="write the folder while it is built, with faults")
+    parser.add_argument("--turns", type=int, help="with --watch: of --pictures frames each that show the object")
     parser.add_argument("--told-truth", action="store_true", help="register by the truth")
     parser.add_argument("options", nargs="*", default=["--prior", "table"], help="of modeler build, after --")
     options = parser.parse_args()
     sequence = options.out / f"{options.shape}-{options.width}-{options.frames}"
     count = min(options.pictures or options.frames, options.frames)
     pictures = options.out / f"{options.shape}-{options.width}-{count}"
+    period = options.frames // options.turns if options.turns else count
     if not pictures.exists():
         write_sequence(pictures, count, shape=options.shape, width=options.width)
     if options.watch:
         sequence = options.out / f"{options.shape}-{options.width}-watched"
         shutil.rmtree(sequence, ignore_errors=True)
         sequence.mkdir()
-        arguments = (sequence, pictures, count, options.frames, lambda: Meter.newest)
+        arguments = (sequence, pictures, count, options.frames, period, lambda: Meter.newest)
         threading.Thread(target=write_slowly, args=arguments, daemon=True).start()
     elif not sequence.exists():
         write_repeated(sequence, pictures, count, options.frames)
@@ -179,7 +187,7 @@ def run() -> int:
     build.Console = Meter
     if options.told_truth:
         known = open_sequence(pictures).truth() or {}
-        truth = {frame: known[frame % count] for frame in range(options.frames)}
+        truth = {frame: known[frame % period % count] for frame in range(options.frames)}
         compose.registrar = lambda *_, **__: Known(truth)
     watched = ["--watch", "--idle-s", "60"] if options.watch else []
     print("  step  " + "  ".join(f"{name:>7}" for name in _FIELDS) + "             edges      wall   processor")
