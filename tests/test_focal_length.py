@@ -253,21 +253,21 @@ def test_covariances_are_those_of_a_graph_with_the_focal_length_as_a_variable(rn
         np.testing.assert_allclose(whiten @ widened.covariances[frame] @ whiten.T, np.eye(6), atol=0.04)
 
 
-def _halved(frame: Frame) -> Frame:
+def _small(frame: Frame) -> Frame:
     camera, mask = frame.camera, frame.mask
     assert mask is not None
-    small = Camera(320, 240, camera.fx / 2, camera.fy / 2, camera.cx / 2, camera.cy / 2)
-    return replace(frame, depth_m=frame.depth_m[::2, ::2].copy(), camera=small, mask=mask[::2, ::2], colour=None)
+    small = Camera(160, 120, camera.fx / 4, camera.fy / 4, camera.cx / 4, camera.cy / 4)
+    return replace(frame, depth_m=frame.depth_m[::4, ::4].copy(), camera=small, mask=mask[::4, ::4], colour=None)
 
 
 @cache
 def built(sigma_focal: float) -> tuple[Step, dict[int, Array]]:
-    """The last step of a run, at half the size, whose focal length is stated 3 % too long, and its true poses."""
+    """The last step of a run, at a quarter of the size, whose focal length is stated 3 % too long, and its true poses."""
     whole = open_sequence(bundled("box"))
     noise, truth = whole.sensor(), whole.truth()
     assert noise is not None
     assert truth is not None
-    frames = [_halved(frame) for frame in RefocusedSequence(whole, FocalFactor(1.03, whole.frame(0).camera.fx))]
+    frames = [_small(frame) for frame in RefocusedSequence(whole, FocalFactor(1.03, whole.frame(0).camera.fx))]
     modeler = Modeler(sensor=Sensor(noise._replace(sigma_focal=sigma_focal)), prior=TablePrior())
     *_, last = modeler.run(frames, modeler.segmenter.scene(frames))
     assert isinstance(last, Step)
