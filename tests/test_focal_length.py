@@ -262,7 +262,7 @@ def _small(frame: Frame) -> Frame:
 
 @cache
 def built(sigma_focal: float) -> tuple[Step, dict[int, Array]]:
-    """The last step of a run, at a quarter of the size, whose focal length is stated 3 % too long, and its true poses."""
+    """The last step of a run, of small images, whose focal length is stated 3 % too long, and the true poses."""
     whole = open_sequence(bundled("box"))
     noise, truth = whole.sensor(), whole.truth()
     assert noise is not None

@@ -9,10 +9,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from modeler.baselines.clouds import Cloud, Fit, Matches, nearest, plane_residuals
-from modeler.baselines.icp import AbstractMultiscaleRegistrar, Linearised, by_levels, descended
+from modeler.baselines.icp import DAMPING, AbstractMultiscaleRegistrar, Linearised, by_levels, descended
 from modeler.types import Array, RayImage
 
-_DAMPING = 1e-9  # relative to the mean spread; only fixes gradients in directions without neighbours
 _MIN_NEIGHBOURS = 4  # points, itself included, that determine the gradient of intensity at a point
 
 
@@ -86,6 +85,6 @@ def intensity_gradients(cloud: Cloud, tree: KDTree, radius_m: float, neighbours:
     mean = np.trace(spread, axis1=1, axis2=2)[:, None, None] + np.finfo(float).tiny
     upright = cloud.normals[:, :, None] * cloud.normals[:, None]
     slopes = np.linalg.solve(
-        spread + mean * (upright + _DAMPING * np.eye(3)), np.einsum("nki,nk->ni", arms, rises)[..., None]
+        spread + mean * (upright + DAMPING * np.eye(3)), np.einsum("nki,nk->ni", arms, rises)[..., None]
     )
     return np.where(known.sum(axis=1, keepdims=True) >= _MIN_NEIGHBOURS, slopes[..., 0], 0.0)

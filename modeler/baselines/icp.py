@@ -24,7 +24,7 @@ from modeler.types import Array, RayImage
 
 _STEP = 1e-6  # rad and m: a smaller step ends a level
 FINE = (1 / 32, 1 / 64)  # voxels that start from a global registration, in sizes of the object
-_DAMPING = 1e-9  # relative to the mean curvature; only fixes unobservable directions
+DAMPING = 1e-9  # relative to the mean curvature; only fixes unobservable directions
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def descended(source: Cloud, pose: Array, iterations: int, linearised: Callable[
     for _ in range(iterations):
         at = linearised(points, pose)
         hessian = (at.jacobian.T * at.weights) @ at.jacobian
-        damping = (_DAMPING * np.trace(hessian) + np.finfo(float).tiny) * np.eye(6)
+        damping = (DAMPING * np.trace(hessian) + np.finfo(float).tiny) * np.eye(6)
         step = np.linalg.solve(hessian + damping, -at.jacobian.T @ (at.weights * at.residuals))
         pose = pose @ se3.exp(step)
         if np.max(np.abs(step)) < _STEP:

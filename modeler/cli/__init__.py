@@ -268,11 +268,7 @@ def _import_numba() -> None:
 
 
 def _check_environment() -> None:
-    """Reject settings under which nothing can be computed, and drop those for developers of the libraries.
-
-    Raises:
-        SystemExit: with status 2 and one line on stderr.
-    """
+    """Reject settings under which nothing can be computed, and drop those for developers of the libraries."""
     threads, interpreted = (os.environ.get(f"NUMBA_{name}", "") for name in ("NUM_THREADS", "DISABLE_JIT"))
     if threads and not (threads.isdecimal() and len(threads) <= _THREAD_DIGITS and int(threads) > 0):
         complain(f"NUMBA_NUM_THREADS={threads[:99]} is not a number of threads; set it to 1 or more, or unset it")
@@ -292,11 +288,7 @@ def _check_environment() -> None:
 
 
 def _check_names(options: Any) -> None:
-    """Reject paths that cannot be file names.
-
-    Raises:
-        InputError: if an option is one.
-    """
+    """Reject paths that cannot be file names."""
     from modeler.types import InputError
 
     for field in fields(options):

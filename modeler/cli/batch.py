@@ -125,11 +125,7 @@ def _sequences(count: int) -> str:
 
 
 def _jobs(options: Batch) -> list[Job]:
-    """Return a job for each sequence, in order, each with a name of its own.
-
-    Raises:
-        InputError: if there is none, or the manifest cannot be used.
-    """
+    """Return a job for each sequence, in order, each with a name of its own."""
     from modeler.batch.engines import threads_of, usual_workers
     from modeler.batch.jobs import Job
     from modeler.cli.manifest import Row, named, read_manifest

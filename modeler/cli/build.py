@@ -179,11 +179,7 @@ class Build:
 
 
 def _go_on(options: Build, known: Path, frames: AbstractSequence) -> int:
-    """Go on with the model of a run, and return the exit status.
-
-    Raises:
-        InputError: if the input or the folder cannot be used.
-    """
+    """Go on with the model of a run, and return the exit status."""
     from modeler.runs.growing import Growth
 
     compile_kernels(say)
@@ -196,11 +192,7 @@ def _go_on(options: Build, known: Path, frames: AbstractSequence) -> int:
 
 
 def _check(options: Build) -> None:
-    """Reject options that contradict each other or are out of range.
-
-    Raises:
-        InputError: if they do.
-    """
+    """Reject options that contradict each other or are out of range."""
     from modeler.types import InputError
     from modeler.viz.viewer import reachable
 
@@ -219,11 +211,7 @@ def _check(options: Build) -> None:
 
 
 def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence, Mapping[int, str]]:
-    """Return the sequence, the selected frames and their digests; what is unreadable is found before anything is made.
-
-    Raises:
-        InputError: if something cannot be read.
-    """
+    """Return the sequence, the selected frames and their digests; what is unreadable is found before all else."""
     from modeler.cli.reading import watched
     from modeler.runs.reopening import calibrated
     from modeler.sequences import KeptSequence, frame_range, open_sequence, survey
@@ -255,12 +243,7 @@ def _run(
     *,
     began_s: float,
 ) -> Mapping[str, Any]:
-    """Show and write every step, and return the last report.
-
-    Raises:
-        InputError: if a frame cannot be read or a file cannot be written.
-        KeyboardInterrupt: if the user interrupted before the first frame.
-    """
+    """Show and write every step, and return the last report."""
     from modeler.cli.reading import while_it_lasts
     from modeler.composition.compose import comes_back
     from modeler.runs.live_advice import advising

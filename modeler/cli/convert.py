@@ -89,11 +89,7 @@ class Convert:
 
 
 def _poses(run: Path, out: Path) -> int:
-    """Write the poses of a run as BOP's scene_gt.json, with the object frame as model frame, or as TUM lines.
-
-    Raises:
-        InputError: if the report cannot be read or the file's ending says neither.
-    """
+    """Write the poses of a run as BOP's scene_gt.json, with the object frame as model frame, or as TUM lines."""
     from modeler import se3
     from modeler.export import RunFolder, poses_of, tum_text, write_atomically
     from modeler.sequences.bop import pose_entry

@@ -63,11 +63,7 @@ class Edit:
 
 
 def _numbers(text: str, frames: Sequence[int]) -> list[int]:
-    """Return the numbers that a list names, those in ranges only where they are frames.
-
-    Raises:
-        InputError: if it is no such list.
-    """
+    """Return the numbers that a list names, those in ranges only where they are frames."""
     from modeler.types import InputError
 
     found: list[int] = []

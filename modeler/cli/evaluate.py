@@ -191,11 +191,7 @@ def _methods(names: str) -> dict[str, AbstractRegistrar]:
 
 
 def _check_offsets(pairing: Pairing, recorded: Sequence[AbstractSequence]) -> None:
-    """Refuse frames so far apart that no sequence has two of them.
-
-    Raises:
-        InputError: if they are.
-    """
+    """Refuse frames so far apart that no sequence has two of them."""
     from modeler.types import InputError
 
     for offset in pairing.offsets:
@@ -222,9 +218,6 @@ def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
         runs: run folders of sequences whose poses and surface are known.
         out: folder, created if missing.
         seed: of the points drawn on the surfaces.
-
-    Raises:
-        InputError: if none can be evaluated, with the reason of the first, or the results cannot be written.
     """
     from modeler.experiment import models_csv, models_json
     from modeler.export import write_atomically

@@ -55,7 +55,7 @@ class Export:
     texture: bool = False
     """Colour by an image wrapped around the mesh, from the sharpest frontal views (OBJ with MTL and PNG, GLB)."""
     texture_px: int = 2048
-    """Side of that image, a square."""
+    """Side of that image, a square; programs that read textures commonly take so many."""
     bop: bool = False
     """Write a BOP model: PLY in mm, origin in the centre of its box, z up, and its entry in models_info.json; the frame
     of --for bop."""
@@ -130,11 +130,7 @@ class Export:
         return 0
 
     def _for(self, purpose: Purpose) -> int:
-        """Write what a program needs.
-
-        Raises:
-            InputError: if options exclude each other, or something cannot be read or written.
-        """
+        """Write what a program needs."""
         from modeler.runs.presets import Preset
 
         _check_numbers(self)

@@ -55,11 +55,7 @@ class Join:
 
 
 def _check(options: Join) -> None:
-    """Refuse options out of range, and a folder that holds something.
-
-    Raises:
-        InputError: if they are such, or another program is writing to the folder.
-    """
+    """Refuse options out of range, and a folder that holds something."""
     from modeler.export import locked
     from modeler.runs.outputs import check_run_folder, run_inputs
     from modeler.types import InputError

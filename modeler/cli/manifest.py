@@ -83,11 +83,7 @@ def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
 
 @cache
 def _arguments(options: tuple[tuple[str, str], ...], common: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the options of a row as `modeler build` takes them.
-
-    Raises:
-        InputError: if it does not.
-    """
+    """Return the options of a row as `modeler build` takes them."""
     words: list[str] = []
     for column, cell in options:
         if column in _FLAGS:

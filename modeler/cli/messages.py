@@ -109,11 +109,7 @@ def kept(asked: Messages, arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _opened(path: Path) -> TextIO:
-    """Open a log to append to.
-
-    Raises:
-        Wrong: if that is not possible, or a file with other content is there.
-    """
+    """Open a log to append to."""
     try:
         if os.path.lexists(path):
             if not path.is_file():

@@ -79,11 +79,7 @@ class Report:
 
 
 def _truth(run: Path, sequences: tuple[Path, ...]) -> Mapping[int, Array] | None:
-    """Return the true camera_from_model by frame number; None if unknown.
-
-    Raises:
-        InputError: if a sequence is not to be found, or is another than the run was made from.
-    """
+    """Return the true camera_from_model by frame number; None if unknown."""
     from modeler.runs.reopening import parts_of
 
     poses: dict[int, Array] = {}

@@ -81,11 +81,7 @@ class Suggest:
         return 0 if found.reached and trusted else 3
 
     def _goal(self) -> tuple[Goal, bool]:
-        """Return the goal, and whether the user gave it.
-
-        Raises:
-            InputError: if a goal is out of range.
-        """
+        """Return the goal, and whether the user gave it."""
         from modeler.suggestion import Goal
         from modeler.types import InputError
 

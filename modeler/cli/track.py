@@ -88,11 +88,7 @@ class Track:
         return _summarise(found, self.out)
 
     def _opened(self, thing: KnownObject) -> tuple[AbstractSequence, AbstractSequence]:
-        """Return the sequence, and the selected frames.
-
-        Raises:
-            InputError: if something cannot be read.
-        """
+        """Return the sequence, and the selected frames."""
         from modeler.cli.reading import watched
         from modeler.runs.reopening import calibrated
         from modeler.sequences import frame_range, open_sequence
@@ -106,11 +102,7 @@ class Track:
         return whole, whole.select(every=self.selection.every, frames=frame_range(self.selection.frames))
 
     def _tracker(self, thing: KnownObject, sequence: AbstractSequence) -> Tracker:
-        """Return the tracker with the parts asked for.
-
-        Raises:
-            InputError: if an option cannot be used.
-        """
+        """Return the tracker with the parts asked for."""
         from modeler.composition import compose
         from modeler.segmentation import Scene
         from modeler.tracking import Tracker
@@ -133,11 +125,7 @@ class Track:
         )
 
     def _tracked(self, tracker: Tracker, frames: AbstractSequence, folder: TrackFolder) -> list[Tracked]:
-        """Track the object through frames, write and show it.
-
-        Raises:
-            InputError: if a frame cannot be read or a file cannot be written.
-        """
+        """Track the object through frames, write and show it."""
         from modeler.cli.reading import reading, while_it_lasts
         from modeler.runs.tracks import PAGE
         from modeler.viz import blueprint, tracking_view

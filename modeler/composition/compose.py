@@ -296,9 +296,6 @@ def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
     Args:
         name: `module:Class`, the module importable from the current folder.
         arguments: its fields, each as `name=value`.
-
-    Raises:
-        InputError: if it cannot be imported or made, or is no prior.
     """
     module_name, _, class_name = name.partition(":")
     if os.getcwd() not in sys.path:

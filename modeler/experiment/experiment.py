@@ -199,9 +199,6 @@ class Experiment:
             source: a view.
             target: the view that it is registered to.
             trusted: the answers before that the method stands by, for a prior that learns.
-
-        Raises:
-            InputError: where the views lack what the method needs.
         """
         try:
             prior = self.prior.learned(Solution(), trusted) if self.learn else self.prior

@@ -60,11 +60,7 @@ def write_bop(model: ObjectModel, out: Path, place: Placement, more: Mapping[str
 
 
 def _entries(path: Path) -> dict[str, Any]:
-    """Return the entries of other objects, by their numbers, in `models_info.json`; its folder is created if missing.
-
-    Raises:
-        InputError: if it cannot be read, or is no such file.
-    """
+    """Return the entries of other objects, by their numbers, in `models_info.json`; its folder is made if missing."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

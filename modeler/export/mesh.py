@@ -302,7 +302,6 @@ def _scale_rgb(shares: Array) -> Array:
     return 255.0 * colormaps["cividis"](np.clip(shares, 0.0, 1.0))[:, :3]
 
 
-SIDE_PX = 2048  # of the image: common in programs that read textures
 PADDING_PX = 4  # charts keep this distance, so that colours do not bleed when the image is shrunk
 TRIANGLES = 8_000  # of a mesh whose detail is in the image
 _FILLED = 0.6  # share of the image that charts fill
@@ -324,7 +323,7 @@ class Texture:
     """Side of a pixel of the image on the surface."""
 
 
-def textured(model: ObjectModel, paint: Paint, side_px: int = SIDE_PX) -> tuple[ObjectModel, Texture]:
+def textured(model: ObjectModel, paint: Paint, side_px: int) -> tuple[ObjectModel, Texture]:
     """Return the model with vertices doubled along seams, and its texture.
 
     Args:

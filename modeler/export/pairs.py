@@ -216,11 +216,7 @@ def _arrays(posterior: Posterior) -> dict[str, np.ndarray]:
 
 
 def _posterior(arrays: dict[str, np.ndarray]) -> Posterior:
-    """Return the posterior that arrays hold.
-
-    Raises:
-        KeyError: where they are those of a posterior with other fields.
-    """
+    """Return the posterior that arrays hold."""
     values: dict[str, Any] = {}
     for field in fields(Posterior):
         name = field.name

@@ -19,7 +19,7 @@ from modeler.pipeline.joining import Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
 from modeler.runs.joining import later_s, write_run
-from modeler.runs.known_objects import known_object
+from modeler.runs.known_objects import is_of_camera, known_object
 from modeler.runs.reopening import Part, Reopened, reopened
 from modeler.sequences import AbstractSequence, Overrides
 from modeler.tracking import Tracked, Tracker
@@ -40,7 +40,6 @@ from modeler.verdict import judged
 
 _PARTNERS: Final = 3  # views of the model that a new one is registered with: two that agree, and one that may fail
 _WHY: Final = Stated("it agrees with the place of the frame on the model")
-_ALIKE: Final = 1e-3  # relative difference of focal lengths of one camera: files have rounded values
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,8 +202,7 @@ def _camera(before: Reopened, frames: AbstractSequence) -> Mapping[str, Any] | N
     if not camera or not camera.get("fx_px"):
         return None
     stated_px = camera["fx_px"] / camera["focal_factor"]
-    fx_px = frames.frame(frames.indices[0]).camera.fx
-    return camera if abs(fx_px / stated_px - 1.0) <= _ALIKE else None
+    return camera if is_of_camera(frames, stated_px) else None
 
 
 def _record(part: Part, frame: int, view: RayImage | None, reason: str) -> dict[str, Any]:

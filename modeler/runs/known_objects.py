@@ -41,9 +41,12 @@ class KnownObject:
         """
         if self.focal is None or sequence.live:
             return sequence
-        fx_px = sequence.frame(sequence.indices[0]).camera.fx
-        same = abs(fx_px / self.focal.stated_px - 1.0) <= _ALIKE
-        return RefocusedSequence(sequence, self.focal) if same else sequence
+        return RefocusedSequence(sequence, self.focal) if is_of_camera(sequence, self.focal.stated_px) else sequence
+
+
+def is_of_camera(sequence: AbstractSequence, stated_px: float) -> bool:
+    """Return whether the focal length of a sequence is the stated one of a camera."""
+    return abs(sequence.frame(sequence.indices[0]).camera.fx / stated_px - 1.0) <= _ALIKE
 
 
 def known_object(path: str | Path, unit: Unit | None = None) -> KnownObject:

@@ -57,19 +57,19 @@ class Preset:
     """Which program it is for."""
     say: Callable[[str], None]
     """Receives what is worth knowing of the files, in words."""
-    overwrite: bool = False
+    overwrite: bool
     """Replace existing files."""
-    triangles: int | None = None
+    triangles: int | None
     """Simplify the mesh to so many; None: what the program and the detail need."""
-    texture_px: int = 2048
+    texture_px: int
     """Side of the texture."""
-    voxel_m: float | None = None
+    voxel_m: float | None
     """Side of a voxel; None: as in the run."""
-    density_kg_m3: float | None = None
+    density_kg_m3: float | None
     """Density of the solid; None: that of water."""
-    mass_kg: float | None = None
+    mass_kg: float | None
     """Mass, instead of a density."""
-    sequences: tuple[Path, ...] = ()
+    sequences: tuple[Path, ...]
     """Where the sequences of the run are now; none: where they were."""
 
     def write(self) -> Checks:
@@ -144,11 +144,7 @@ class Preset:
         return run.volume(Fuser(voxel_m=self.voxel_m or run.report["settings"].get("voxel_m")))
 
     def _model(self, *, watertight: bool) -> ObjectModel:
-        """Return the mesh in the object frame.
-
-        Raises:
-            InputError: if the views give no surface.
-        """
+        """Return the mesh in the object frame."""
         model = self._volume.model(watertight=watertight)
         if not len(model.triangles):
             raise InputError(f"{self.run_folder}: its views give no surface; more of them are needed")

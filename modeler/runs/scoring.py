@@ -36,11 +36,7 @@ def scores_of(path: Path, seed: int) -> list[ModelScore]:
 
 
 def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
-    """Return the true camera_from_model (4, 4) by frame number, and the true surface.
-
-    Raises:
-        InputError: if a part of the run does not know them, or parts that were joined know different surfaces.
-    """
+    """Return the true camera_from_model (4, 4) by frame number, and the true surface."""
     poses: dict[int, Array] = {}
     meshes: list[Mesh] = []
     for part in parts:

@@ -60,11 +60,7 @@ class Recorder:
             self.fault = str(error)
 
     def _write(self, frame: Frame) -> None:
-        """Write a view: depth last, with which it is complete.
-
-        Raises:
-            InputError: if a file cannot be written.
-        """
+        """Write a view: depth last, with which it is complete."""
         name, camera, unit_mm = f"{self.taken:06d}.png", frame.camera, finest_unit_mm(REACH_M)
         if not self.taken:
             known = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "depth_scale": unit_mm}

@@ -372,11 +372,7 @@ class Scan:
         return run.with_name(f"{run.name}-edited")
 
     def _source(self) -> Path:
-        """Return the folder that a build reads: the capture, or its frames with the masks as they are shown.
-
-        Raises:
-            InputError: if frames cannot be written, or masks are not there yet.
-        """
+        """Return the folder that a build reads: the capture, or its frames with the masks as they are shown."""
         if not self.painted:
             return Path(self.choices.sequence)
         with self._lock:

@@ -158,11 +158,7 @@ class _Server(uvicorn.Server):
 
 
 def _listening(port: int) -> socket.socket:
-    """Return a socket of the port, so that the address is right before anybody asks.
-
-    Raises:
-        InputError: if the port cannot be had.
-    """
+    """Return a socket of the port, so that the address is right before anybody asks."""
     listening = socket.socket()
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

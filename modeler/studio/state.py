@@ -103,11 +103,7 @@ class Studio:
         self.capture = self.recorder = None
 
     def _chosen(self, sequence: Path) -> tuple[Path, Choices]:
-        """Return the folder and the choices of the scan of a capture, or those of a new one.
-
-        Raises:
-            InputError: if a file of choices is none of ours.
-        """
+        """Return the folder and the choices of the scan of a capture, or those of a new one."""
         place = str(sequence.absolute())
         for folder in self.folders():
             if (kept := Choices.read(folder / STATE)).sequence == place:

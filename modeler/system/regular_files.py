@@ -142,11 +142,7 @@ def unreadable(path: Path, error: OSError) -> InputError:
 
 
 def _check(path: Path, mode: int) -> None:
-    """Reject other than regular files by mode.
-
-    Raises:
-        InputError: if it is none.
-    """
+    """Reject other than regular files by mode."""
     if not stat.S_ISREG(mode):
         kind = _KINDS.get(stat.S_IFMT(mode), "something else")
         raise InputError(f"{path}: is {kind}, not a regular file; put the file itself there.")

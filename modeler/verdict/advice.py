@@ -14,11 +14,10 @@ from modeler.types import AbstractPrior, Array, Failed, Outcome, Posterior, Reas
 from modeler.verdict.evidence import MAX_UNSURE, WRONG_SHARE
 
 _SURE_STEPS: Final = 3  # least number of pairs for a measured step
-_FAR_SDS: Final = 3.0  # of the given step, beyond which the measured one contradicts it
+_FAR_SDS: Final = 3.0  # of what is given, beyond which what is measured contradicts it; chance in 3 of 1000 runs
 _ROUGH: Final = (
     0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
 )
-_CHANCE_SDS: Final = 3.0  # of the given focal length; chance in 3 of 1000 runs
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method/search.md)
 _FAR_DEG: Final = 100.0  # 1 % of this rotation is 1°, a third of a wrong pose
 _BY_OPTIONS: Final = {
@@ -161,7 +160,7 @@ def contradicted_focal_length(camera: Mapping[str, Any]) -> str:
     Args:
         camera: as in report.json.
     """
-    if (sds := camera.get("given_sds", 0.0)) <= _CHANCE_SDS:
+    if (sds := camera.get("given_sds", 0.0)) <= _FAR_SDS:
         return ""
     return (
         f"it contradicts the given one by {sds:.1f} of its standard deviations, which distances along the ray, "
