@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +128,8 @@ def test_the_study_by_camera_runs_and_repeats_itself(tmp_path: Path, capsys: pyt
         for prior in ("general", "table")
         for method in ("visibility", "icp")
     }
-    assert [one.nees for one in trials] == pytest.approx([one.nees for one in study.trials(0)], nan_ok=True)
+    again = islice(study.trials(0), 2)
+    assert [one.nees for one in trials[:2]] == pytest.approx([one.nees for one in again], nan_ok=True)
     assert "independent pixels" in text(trials)
     with pytest.raises(SystemExit):
         main(["--frames", "1", "--out", str(tmp_path)])

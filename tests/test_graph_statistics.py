@@ -211,7 +211,7 @@ def test_errors_that_all_poses_share_are_none_of_the_model() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.8])
 def test_errors_from_the_mean_of_all_poses_are_calibrated(share: float) -> None:
     values = []
-    for seed in range(100):
+    for seed in range(50):
         solution = solve(_graph(np.random.default_rng(seed), share), {}, shared=share)
         moved = {
             k: se3.adjoint(pose) @ se3.log(se3.inverse(pose) @ TRUTH[k]) for k, pose in solution.trajectory.items()
@@ -222,7 +222,7 @@ def test_errors_from_the_mean_of_all_poses_are_calibrated(share: float) -> None:
         to_object = se3.adjoint(solution.trajectory[k])
         covariance = to_object @ about_mean.covariances[k] @ to_object.T
         values.append(error @ np.linalg.solve(covariance, error))
-    assert np.mean(values) == pytest.approx(6.0, abs=TOLERANCE)
+    assert np.mean(values) == pytest.approx(6.0, abs=np.sqrt(2.0) * TOLERANCE)
 
 
 def test_no_loop_tells_what_all_views_err_by() -> None:

@@ -15,7 +15,7 @@ from modeler.types import InputError
 from studies.fuzz.mutate import mutated, with_sums
 from studies.fuzz.targets import TARGETS, fresh, tiny, truth
 
-INPUTS = 40
+INPUTS = 20
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
@@ -58,7 +58,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @given(which=st.sampled_from(["scene_camera.json", "scene_gt.json", "sequence.json"]), tree=ENTRIES | JSON)
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_any_json_is_read_or_refused(scene: Path, which: str, tree: object) -> None:
     path = scene / which
     intact, stated = path.read_bytes(), ""
