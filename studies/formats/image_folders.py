@@ -7,6 +7,7 @@ import json
 import struct
 import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,19 +32,19 @@ def unchecked(value: _Value, **changes: object) -> _Value:
 
 
 def small_frames(count: int = 4) -> list[Frame]:
-    """Return frames of the bundled box at 160 x 120, in whole millimetres."""
-    frames = []
-    whole = open_sequence(bundled("box"))
-    for index in whole.indices[:count]:
-        frame = whole.frame(index)
-        camera = frame.camera
-        small = Camera(160, 120, camera.fx / STEP, camera.fy / STEP, camera.cx / STEP, camera.cy / STEP)
-        depth_m = (np.rint(frame.depth_m[::STEP, ::STEP] * 1000.0) * np.float32(0.001)).astype(np.float32)
-        mask, colour = frame.mask, frame.colour
-        assert mask is not None
-        assert colour is not None
-        frames.append(Frame(index, frame.time_s, depth_m, small, mask[::STEP, ::STEP], colour[::STEP, ::STEP]))
-    return frames
+    """Return frames of the bundled box at 160 x 120, in whole millimetres: the same whenever asked for."""
+    return [_small_frame(index) for index in range(count)]
+
+
+@cache
+def _small_frame(index: int) -> Frame:
+    frame = open_sequence(bundled("box")).frame(index)
+    camera, mask, colour = frame.camera, frame.mask, frame.colour
+    small = Camera(160, 120, camera.fx / STEP, camera.fy / STEP, camera.cx / STEP, camera.cy / STEP)
+    depth_m = (np.rint(frame.depth_m[::STEP, ::STEP] * 1000.0) * np.float32(0.001)).astype(np.float32)
+    assert mask is not None
+    assert colour is not None
+    return Frame(index, frame.time_s, depth_m, small, mask[::STEP, ::STEP], colour[::STEP, ::STEP])
 
 
 def small_truth(count: int = 4) -> dict[int, np.ndarray]:
