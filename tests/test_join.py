@@ -70,9 +70,8 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
         edges.append(Edge(Posterior(after, before, pose, Outcome.CONVERGED, overlap=0.9), kind, True, Stated("true")))
     solution = solve(PoseGraph(tuple(edges), first=0), {})
     folder = RunFolder.open(path)
-    meta, records = RunMeta(sequence=str(scene), seed=0, prior="turntable"), []
+    steps = []
     for k, view in views.items():
-        last = k == max(views)
         assert view.frame.mask is not None
         step = Step(
             frame=view.frame,
@@ -85,10 +84,11 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
             make_model=partial(Fuser().fuse, views, solution.trajectory),
             edges_so_far=tuple(edges),
             views=views,
-            last=last,
+            last=k == max(views),
         )
-        records.append(step.record)
-        folder.write(replace(step, frames_so_far=tuple(records)), meta)
+        steps.append(step)
+    last = replace(steps[-1], frames_so_far=tuple(step.record for step in steps))
+    folder.write(last, RunMeta(sequence=str(scene), seed=0, prior="turntable"))
 
 
 @pytest.fixture(scope="module")
