@@ -14,7 +14,7 @@ from modeler.segmentation import DepthNoise
 from modeler.segmentation.depth_images import mixed_pixels, pieces, planning_stride, point_image, without_specks
 from modeler.segmentation.planes import dominant_planes, heights
 from modeler.tracking.rendering import ModelRenderer
-from modeler.types import Array, BoolArray, Frame
+from modeler.types import Array, BoolArray, Frame, Plane
 
 _SCENERY = 0.7  # squares of the model's width: larger planes are tables and walls; a cube's face is a third of one
 _GRAZING = 0.05  # least cosine of a plane with the line of sight, below which its area is not known
@@ -59,6 +59,14 @@ class CandidateFinder:
                         found.append((not whole, abs(np.log(extent)), without_specks(part)))
         found.sort(key=lambda one: one[:2])  # whole pieces first
         return [mask for _, _, mask in found[: self.most]]
+
+    def is_scenery(self, plane: Plane, frame: Frame, renderer: ModelRenderer) -> bool:
+        """Return whether a plane is that of a table or wall: larger than the model."""
+        points = self._points(frame)
+        on = points[np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[..., 2])]
+        cosines = np.abs(on @ plane.normal) / np.linalg.norm(on, axis=1)
+        areas_m2 = on[:, 2] ** 2 / (frame.camera.fx * frame.camera.fy * np.maximum(cosines, _GRAZING))
+        return bool(areas_m2.sum() > _SCENERY * (2.0 * renderer.radius_m) ** 2)
 
     def near(self, frame: Frame, camera_from_model: Array, renderer: ModelRenderer) -> BoolArray:
         """Return the mask (h, w) of what is near the model in a pose (4, 4), and not part of tables and walls."""

