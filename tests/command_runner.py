@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -45,3 +46,13 @@ def runner(capfd: pytest.CaptureFixture[str]) -> Run:
         return Ended(status, str(said.out), str(said.err))
 
     return run
+
+
+def with_files_of_at_most(size: int, *arguments: str) -> int:
+    """Run a command that cannot write larger files: to it that is what a full disk is, in the middle of a file."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))  # Python ignores the signal that goes with it
+    try:
+        return main(list(arguments))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from source_trees import ROOT
+from source_trees import SOURCES, tree
 
 from modeler import priors, se3
 from modeler.cli.build import Build
@@ -165,12 +165,11 @@ def test_messages_name_parameters_and_options_that_exist() -> None:
     """Parameters stand in backticks, options behind two hyphens, in every text of the sources that is no docstring."""
     options = {option.removeprefix("--") for option in _options().values()} | {"help", "version", "purpose"}
     unknown = set()
-    for path in (path for folder in ("modeler", "sequences", "viz") for path in (ROOT / folder).rglob("*.py")):
+    for path in SOURCES:
         if path.name in ("messages.py", "viewer.py"):  # options of all commands, and those of Rerun
             continue
-        tree = ast.parse(path.read_text())
-        given = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-        for node in ast.walk(tree):
+        given = {id(node.value) for node in ast.walk(tree(path)) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree(path)):
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in given:
                 named = re.findall(r"`(\w+)`", node.value)
                 named += re.findall(r"(?<![\w-])--([a-z][a-z0-9-]+)", node.value)

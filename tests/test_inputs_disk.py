@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -14,23 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from command_runner import QUICK
+from command_runner import QUICK, with_files_of_at_most
 
 from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.sequences import open_sequence, write_bop
 from modeler.types import InputError
 from studies.formats.image_folders import small_frames
-
-
-def with_files_of_at_most(size: int, *arguments: str) -> int:
-    """Run a command that cannot write larger files: to it that is what a full disk is, in the middle of a file."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))  # Python ignores the signal that goes with it
-    try:
-        return main(list(arguments))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def ours(said: str) -> list[str]:
