@@ -21,6 +21,7 @@ STEEPEST_RAD = 1.40  # steeper steps between neighbouring pixels (80°) are dept
 # Pixels from an edge within which colours may be those of the background: depth and colour are aligned to some pixels.
 # Measured: over six captures the colours of held-out views are predicted best with 6 to 16.
 BLEEDING_PX = 10.0
+OUTLINED = 200  # points of a view from which the error of its outline is taken
 SAMPLES = 20000  # points at which views are compared
 LOOKUPS = 10_000_000  # samples times views, at most, which bounds time
 BATCH = 1 << 18  # points or lookups per kernel call, which bounds memory
@@ -35,7 +36,7 @@ class Cropping:
     """Selection and weights of a view's pixels."""
 
     margin_px: int
-    """A pixel carves only as far as all pixels within this distance."""
+    """A pixel carves only as far as all pixels within this distance, or less where the pose allows."""
     min_cosine: float
     """Points seen at a smaller cosine between normal and ray are left out."""
     edge_weight: float
@@ -144,6 +145,22 @@ def free_of(depth_m: npt.NDArray[np.float32], margin_px: int) -> npt.NDArray[np.
     measured = np.isfinite(depth_m) & (depth_m > 0.0)
     reach_m = minimum_filter(np.where(measured, depth_m, np.inf), size=2 * margin_px + 1, mode="nearest")
     return np.where(measured, reach_m, 0.0).astype(np.float32)
+
+
+def _margin_px(view: RayImage, covariance: Array | None) -> int:
+    """Return the distance within which all pixels around one must see past a point for it to be free.
+
+    Outlines lie within a pixel, which mixes object and background, and two standard deviations by the pose's error. A
+    pixel is half a pixel wide to either side.
+    """
+    points_m = view.points_m[:: max(1, len(view.points_m) // OUTLINED)]
+    if covariance is None or not len(points_m):
+        return 1
+    x, y, z = points_m.T
+    none, one = np.zeros_like(z), np.ones_like(z)
+    across = np.stack([np.stack([none, z, -y, one, none, none], 1), np.stack([-z, none, x, none, one, none], 1)], 1)
+    moved = np.einsum("nki,ij,nkj->nk", across / z[:, None, None], covariance, across / z[:, None, None])
+    return int(np.ceil(0.5 + 2.0 * view.frame.camera.fx * float(np.sqrt(moved.mean()))))
 
 
 def pose_variances(part: Crop, covariance: Array | None, sigma_r_m: float) -> Array:
@@ -265,14 +282,14 @@ def depth_views(
     colour = np.zeros((*size, 3), dtype=np.uint8)
     intrinsics, surfaces, counts = [], [], []
     for number, ((view, pose), where) in enumerate(zip(one_by_one(pairs), windows, strict=True)):
-        part = crop(view, where, cropping)
+        covariance = None if covariances is None else covariances.get(view.index)
+        part = crop(view, where, replace(cropping, margin_px=min(cropping.margin_px, _margin_px(view, covariance))))
         here = number, *map(slice, part.index.shape)
         index[here] = np.where(part.index >= 0, part.index + sum(counts), -1)
         free_m[here], background_m[here] = part.free_m, part.background_m
         if part.colour is not None:
             colour[here] = part.colour
         intrinsics.append(part.intrinsics)
-        covariance = None if covariances is None else covariances.get(view.index)
         surfaces.append(
             (
                 se3.transform(pose, part.points_m),
