@@ -148,7 +148,7 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
                 frame = sequence.frame(index)
             except InputError as error:
                 faults[index] = error
-                if now - failing.setdefault(index, now) < patience.settle_s:
+                if not ended and now - failing.setdefault(index, now) < patience.settle_s:
                     break  # it may be being written
                 continue
             yield frame

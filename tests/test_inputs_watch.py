@@ -176,6 +176,16 @@ def test_what_cannot_be_read_in_the_end_is_left_out_and_said(
     assert caplog.text.count("continuing with the frames so far") == 2
 
 
+def test_frames_behind_one_that_cannot_be_read_are_not_lost_at_the_end(tmp_path: Path, frames: list[Frame]) -> None:
+    """The mark of the end comes before the damaged frame was looked at for the first time."""
+    write_tum(tmp_path / "s", frames, {})
+    damaged = sorted((tmp_path / "s" / "depth").iterdir())[3]
+    damaged.write_bytes(damaged.read_bytes()[:40])
+    (tmp_path / "s" / "done").touch()
+    found = [frame.index for frame in arriving(tmp_path / "s", Overrides(), QUICK, lambda: False)]
+    assert found == [0, 1, 2, 4]
+
+
 @pytest.mark.parametrize("lost", ["s", "s/scene_camera.json"])
 def test_what_goes_away_ends_the_sequence(
     tmp_path: Path, frames: list[Frame], caplog: pytest.LogCaptureFixture, lost: str

@@ -358,7 +358,7 @@ class Console:
         if len(self._held) == 1:
             self._say(f"frame {self._held[0]} is {self._reported}")
         elif self._held:
-            self._say(f"frames {self._held[0]} to {self._held[-1]} are {self._reported}")
+            self._say(f"frames {min(self._held)} to {max(self._held)} are {self._reported}")
         self._reported, self._aloud, self._held = "", 0, []
 
     def _why(self, reason: Reason, posteriors: Sequence[Posterior]) -> str:
