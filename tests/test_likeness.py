@@ -51,6 +51,20 @@ def test_print_of_another_side_that_is_alike_contradicts_the_match(found_deg: li
         assert abs(pair.correlation) < 0.2
 
 
+@pytest.mark.parametrize(("right", "holds"), [(0, False), (1, True)])
+def test_of_pairs_across_segments_that_agrees_best_decides(right: int, holds: bool) -> None:
+    """Seen from 90° apart; all but so many show another side."""
+    pairs = likenesses(printed(angles_deg=SIDES_DEG), poses_of([*SIDES_DEG]), 0.005)
+    within = [pair for pair in pairs if (pair.first < 4) is (pair.second < 4)]
+    usual = max(pair.correlation for pair in within)
+    kind = replace(within[0], motion=turned(90.0), across=True)
+    across = [replace(kind, first=k, second=4 + k, correlation=usual if k < right else 0.1 * usual) for k in range(3)]
+    for some, expected in ((across, holds), (across[1:2], True)):  # a single one may be seen too obliquely
+        found = print_check([*within, *some])
+        assert found is not None
+        assert found[1].holds is expected
+
+
 def test_a_side_without_print_contradicts_nothing() -> None:
     views, plain = printed(angles_deg=SIDES_DEG), printed(0.0, noise=2.0, angles_deg=SIDES_DEG)
     mixed = {k: plain[k] if k in (4, 5) else views[k] for k in (*range(6),)}

@@ -214,8 +214,9 @@ def _alike(
     step: Step, edges: Sequence[Edge], prior: AbstractPrior | None, tolerance_m: float, *, colour: bool
 ) -> list[_Finding]:
     """Return whether views that match may show different sides that are alike, as far as print and shape tell."""
-    joined = {(min(edge.source, edge.target), max(edge.source, edge.target)) for edge in edges}
-    pairs = likenesses(step.views, step.solution.trajectory, tolerance_m, joined, colour=colour)
+    joined = {(min(edge.source, edge.target), max(edge.source, edge.target)): edge.kind for edge in edges}
+    across = {pair for pair, kind in joined.items() if kind == "join"}
+    pairs = likenesses(step.views, step.solution.trajectory, tolerance_m, joined, across, colour=colour)
     found = []
     if (by_print := print_check(pairs)) is not None:
         pair, check = by_print

@@ -64,6 +64,8 @@ class Likeness:
     """Of print; NaN if it was not compared."""
     contrast: float = np.nan
     """Variance of print, of the view that has less."""
+    across: bool = False
+    """Whether they are registered across segments, whatever the angle."""
 
     @property
     def angle_deg(self) -> float:
@@ -76,6 +78,7 @@ def likenesses(
     trajectory: Mapping[int, Array],
     tolerance_m: float,
     edges: Container[tuple[int, int]] = (),
+    across: Container[tuple[int, int]] = (),
     *,
     colour: bool = True,
 ) -> list[Likeness]:
@@ -86,6 +89,7 @@ def likenesses(
         trajectory: object_from_camera (4, 4) by frame number.
         tolerance_m: distance within which surface matches.
         edges: pairs of frame numbers, the lower one first.
+        across: those of them that join segments.
         colour: whether print is compared.
     """
     frames = [frame for frame in sorted(trajectory) if frame in views and len(views[frame].points_m)]
@@ -109,7 +113,9 @@ def likenesses(
         beside, whole = np.min([_shares(*match) for match in matches], axis=0) if known else (1.0, 1.0)
         shaped = bool(beside >= _BESIDE or whole >= 1.0 - TOLERANCE)
         one = Likeness(first, second, motion, there.mean(axis=0) if known else np.zeros(3), shaped)
-        if compared is not None and first in coloured and second in coloured and NEAR_DEG <= angle_deg <= FAR_DEG:
+        one = replace(one, across=(first, second) in across)
+        comparable = NEAR_DEG <= angle_deg and (angle_deg <= FAR_DEG or one.across)
+        if compared is not None and first in coloured and second in coloured and comparable:
             correlation, contrast = _print(compared, features, first, second)
             one = replace(one, correlation=correlation, contrast=contrast)
         found.append(one)
@@ -185,7 +191,7 @@ def print_check(pairs: Sequence[Likeness]) -> tuple[Likeness, Check] | None:
 
     Where print of the same contrast is on surface that matches, it agrees as well as in other pairs of the run, or one
     of the poses is wrong. Light and oblique sight lower a correlation now and then: it counts if no chain of pairs that
-    agree joins the two frames. None if print agrees nowhere.
+    agree joins the two frames; of pairs across segments, the one that agrees best counts. None if print agrees nowhere.
 
     Args:
         pairs: of a run.
@@ -197,14 +203,11 @@ def print_check(pairs: Sequence[Likeness]) -> tuple[Likeness, Check] | None:
         return None
     contrast = float(np.median([pair.contrast for pair in agreeing]))
     group = _groups(pairs, agreeing)
-    apart = [
-        pair
-        for pair in printed
-        if group[pair.first] != group[pair.second]
-        and pair.angle_deg <= _CLEAR_DEG
-        and pair.contrast >= _HALF * contrast
-    ]
-    worst = min(apart or agreeing, key=lambda pair: pair.correlation)
+    apart = [pair for pair in printed if group[pair.first] != group[pair.second] and pair.contrast >= _HALF * contrast]
+    clear = [pair for pair in apart if pair.angle_deg <= _CLEAR_DEG]
+    if len(across := [pair for pair in apart if pair.across]) > 1:  # seen at any angle: one that agrees is enough
+        clear.append(max(across, key=lambda pair: pair.correlation))
+    worst = min(clear or agreeing, key=lambda pair: pair.correlation)
     return worst, Check(min(max(worst.correlation, 0.0) / usual, 1.0), _HALF, at_least=True)
 
 
