@@ -59,7 +59,8 @@ def test_true_poses_give_the_model_of_true_poses_in_whatever_frame(scored: list[
     seen, whole = scores["run", "seen"], scores["run", "whole"]
     assert seen.f_3mm > 0.97
     assert seen.accurate_3mm == whole.accurate_3mm
-    assert whole.complete_3mm < 0.9 < seen.complete_3mm  # nobody saw the bottom
+    # Nobody saw the bottom, 10.4 % of a box of 75 x 130 x 180 mm, of which 1.3 % lie within 3 mm of its rim.
+    assert whole.complete_3mm < 0.91 < seen.complete_3mm
 
 
 def test_a_model_ten_millimetres_too_far_scores_less_than_one_of_true_poses(modelled: Modelled) -> None:

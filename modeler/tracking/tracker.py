@@ -129,6 +129,8 @@ class Tracker:
     """Each frame has its own random generator, seeded with this and the frame's number."""
     newest: list[Tracked] = field(default_factory=list, init=False, repr=False)
     """The last two frames, at most, in which the object was placed one after the other."""
+    _around: list[Viewpoints] = field(default_factory=list, init=False, repr=False)
+    """The viewpoints of the last searches."""
 
     def __post_init__(self) -> None:
         """Reject a model without surface, and a seed that random generators do not take.
@@ -176,11 +178,12 @@ class Tracker:
         if segmented:
             view = self._view(frame, support=not self._follows or self.prior is not None)
             followed = None if view is None else self._followed(view, rng)
-            if followed is not None:
+            if followed is not None and (followed.usable or not self.newest[-1].usable):
                 return followed
             view = self._view(frame, support=True) if self._follows else view
             if view is not None or frame.mask is not None:
-                return nothing if view is None else self._found([view], rng)
+                found = nothing if view is None else self._found([view], rng)
+                return found if followed is None or found.usable else followed
         clear = frame.unoccluded
         if self._follows:
             near = self.finder.near(clear, self._predicted(frame), self.renderer)
@@ -452,11 +455,6 @@ class Tracker:
             known = Viewpoints.around(self.renderer, count, camera, self.sensor, distance_m)
             self._around[:] = [*self._around[-(_MOST_AROUND - 1) :], known]
         return known
-
-    @cached_property
-    def _around(self) -> list[Viewpoints]:
-        """The viewpoints of the last searches."""
-        return []
 
 
 _SYMMETRIES = SymmetryFinder(points=1000, icp_points=150, directions=0)
