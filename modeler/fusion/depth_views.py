@@ -148,10 +148,10 @@ def free_of(depth_m: npt.NDArray[np.float32], margin_px: int) -> npt.NDArray[np.
 
 
 def _margin_px(view: RayImage, covariance: Array | None) -> int:
-    """Return the distance within which all pixels around one must see past a point for it to be free.
+    """Return the distance in px within which all pixels around one must see past a point for it to be free.
 
-    Outlines lie within a pixel, which mixes object and background, and two standard deviations by the pose's error. A
-    pixel is half a pixel wide to either side.
+    A pixel at an outline mixes object and background: the outline is up to half a pixel from its middle, and up to two
+    standard deviations of the pose's error farther.
     """
     points_m = view.points_m[:: max(1, len(view.points_m) // OUTLINED)]
     if covariance is None or not len(points_m):

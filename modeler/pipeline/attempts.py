@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final, Literal, final
 
 import numpy as np
-from scipy.special import chdtri
 
 from modeler import se3
 from modeler.closure import Closer
@@ -37,7 +36,7 @@ from modeler.types import (
     are_separate,
     pooled,
 )
-from modeler.verdict.evidence import TAIL, distance_nats
+from modeler.verdict.evidence import TAIL_NATS, distance_nats
 
 FULL: Final = 1.0
 """Effort of a registration that may become an edge."""
@@ -148,7 +147,7 @@ class Search:
         with suppress(InputError):
             density = prior.relaxed(max(steps, 2)).between(self.view, self.state.views[posterior.target])
             means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
-            return distance_nats(density, float(density.log_prior(means).max())) > 0.5 * float(chdtri(6, TAIL))
+            return distance_nats(density, float(density.log_prior(means).max())) > TAIL_NATS
         return False
 
     @property

@@ -14,7 +14,7 @@ from modeler.segmentation import DepthNoise
 from modeler.segmentation.depth_images import mixed_pixels, pieces, planning_stride, point_image, without_specks
 from modeler.segmentation.planes import dominant_planes, heights
 from modeler.tracking.rendering import ModelRenderer
-from modeler.types import Array, BoolArray, Frame, Plane
+from modeler.types import Array, BoolArray, Camera, Frame, Plane
 
 _SCENERY = 0.7  # squares of the model's width: larger planes are tables and walls; a cube's face is a third of one
 _GRAZING = 0.05  # least cosine of a plane with the line of sight, below which its area is not known
@@ -62,11 +62,11 @@ class CandidateFinder:
 
     def is_scenery(self, plane: Plane, frame: Frame, renderer: ModelRenderer) -> bool:
         """Return whether a plane is that of a table or wall: larger than the model."""
-        points = self._points(frame)
-        on = points[np.abs(plane.height_m(points)) < self.noise.tolerance_m(points[..., 2])]
-        cosines = np.abs(on @ plane.normal) / np.linalg.norm(on, axis=1)
-        areas_m2 = on[:, 2] ** 2 / (frame.camera.fx * frame.camera.fy * np.maximum(cosines, _GRAZING))
-        return bool(areas_m2.sum() > _SCENERY * (2.0 * renderer.radius_m) ** 2)
+        stride = planning_stride(frame.camera)
+        thin = self._points(frame)[::stride, ::stride]
+        on = thin[np.abs(plane.height_m(thin)) < self.noise.tolerance_m(thin[..., 2])]
+        area_m2 = _areas_m2(on, plane.normal, frame.camera, stride).sum()
+        return bool(area_m2 > _SCENERY * (2.0 * renderer.radius_m) ** 2)
 
     def near(self, frame: Frame, camera_from_model: Array, renderer: ModelRenderer) -> BoolArray:
         """Return the mask (h, w) of what is near the model in a pose (4, 4), and not part of tables and walls."""
@@ -102,11 +102,9 @@ class CandidateFinder:
         pixel_m = (depth_m / frame.camera.fx).astype(np.float32)
         off: BoolArray = np.isfinite(depth_m) & ~mixed_pixels(depth_m, tolerance_m=tolerance_m, pixel_m=pixel_m)
         thin = points[::stride, ::stride]
-        rays = thin / thin[..., 2:]
-        pixel_m2 = (stride * thin[..., 2]) ** 2 / (frame.camera.fx * frame.camera.fy)
         for plane in dominant_planes(thin, self.noise):
             on = np.abs(heights(points, plane)) < tolerance_m
-            area_m2 = pixel_m2 / np.maximum(np.abs(rays @ plane[:3].astype(np.float32)), _GRAZING)
+            area_m2 = _areas_m2(thin, plane[:3], frame.camera, stride)
             labels = pieces(thin[..., 2], on[::stride, ::stride])
             areas = np.bincount(labels.ravel(), np.where(labels > 0, area_m2, 0.0).ravel())
             large = np.flatnonzero(areas > _SCENERY * width_m**2)
@@ -135,3 +133,16 @@ class CandidateFinder:
             seed = int(np.argmax(distance_m))
             if distance_m[seed] < renderer.radius_m:
                 return
+
+
+def _areas_m2(points: np.ndarray, normal: Array, camera: Camera, stride: int) -> np.ndarray:
+    """Return the areas (…) in m² of pixels on a plane.
+
+    Args:
+        points: (…, 3) of every `stride`-th pixel.
+        normal: (3,) of the plane.
+        camera: of the image.
+        stride: pixels from one to the next.
+    """
+    slants = np.maximum(np.abs(points / points[..., 2:] @ normal.astype(np.float32)), _GRAZING)
+    return (stride * points[..., 2]) ** 2 / (camera.fx * camera.fy) / slants

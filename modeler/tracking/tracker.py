@@ -55,7 +55,7 @@ _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames befo
 _MOST_STEPS = 3.0  # over which a velocity is extrapolated
 _OVERLAP = 0.6  # least, with any rotation
 # Least number of patches of the frame or share of the model that match: of other shapes, up to 13.6 do where all fits.
-_PATCHES, _SHOWN = 14.0, 0.3
+_LEAST_PATCHES, _SHOWN = 14.0, 0.3
 _PER_PATCH = np.log(2.0)  # nats for each patch of a candidate: other surface matches by chance every second time
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
 _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
@@ -481,7 +481,7 @@ def _enough(pair: PairLikelihood) -> bool:
         float(np.mean(side.classify(se3.rows(np.eye(4))) == point_likelihood.MATCHED))
         for side in (pair.forward, pair.backward)
     )
-    return pair.backward.image.patches * frames > _PATCHES or models > _SHOWN
+    return pair.backward.image.patches * frames > _LEAST_PATCHES or models > _SHOWN
 
 
 def _of_model(motion: PoseGaussian, rendered: Array) -> PoseGaussian:

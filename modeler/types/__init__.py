@@ -56,6 +56,7 @@ from modeler.types.solution import EdgeKind as EdgeKind
 from modeler.types.solution import FocalLength as FocalLength
 from modeler.types.solution import LoopClosureError as LoopClosureError
 from modeler.types.solution import Solution as Solution
+from modeler.types.solution import components as components
 from modeler.types.solution import joined_without as joined_without
 from modeler.types.solution import loop_closure_error as loop_closure_error
 from modeler.types.solution import loop_closure_errors as loop_closure_errors

@@ -267,7 +267,7 @@ def segments(edges: Sequence[Edge]) -> dict[int, int]:
     ends = _ends(edges)
     frames, indices = np.unique(ends, return_inverse=True)
     indices = indices.reshape(-1, 2)[np.array([edge.kind != "join" for edge in edges], dtype=bool)]
-    return dict(zip(frames.tolist(), _labels(indices, len(frames)).tolist(), strict=True))
+    return dict(zip(frames.tolist(), components(indices, len(frames)).tolist(), strict=True))
 
 
 def joined_without(edge: Edge, edges: Sequence[Edge]) -> bool:
@@ -284,10 +284,10 @@ def _ends(edges: Sequence[Edge]) -> npt.NDArray[np.int64]:
 def _parts(ends: npt.NDArray[np.int64], everything: npt.NDArray[np.int64]) -> int:
     """Return the number of connected components of the frames of `everything` (n, 2) under edges (m, 2)."""
     frames = np.unique(everything)
-    return len(set(_labels(np.searchsorted(frames, ends), len(frames)).tolist()))
+    return len(set(components(np.searchsorted(frames, ends), len(frames)).tolist()))
 
 
-def _labels(ends: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int32]:
+def components(ends: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int32]:
     """Return the number (count,) of the connected component of each of `count` nodes under edges (m, 2)."""
     from scipy.sparse import coo_array  # with which nouns alone take twice as long to import
     from scipy.sparse.csgraph import connected_components

@@ -32,6 +32,8 @@ MIN_MOTION_SDS: Final = 3.0
 """Displacement of the surface in standard deviations of a pixel's range: below, no motion is detectable."""
 TAIL: Final = 1e-6
 """Probability per pair of contradicting the prior by chance: one of 100 runs of 100 pairs."""
+TAIL_NATS: Final = 0.5 * float(chdtri(6, TAIL))
+"""Distance from the mode of a prior in nats of a Gaussian that is exceeded so seldom."""
 LOOP_TAIL: Final = 1e-3
 """Probability that a run has such loop closure errors by chance; that of the closure gate."""
 MAX_VIOLATIONS: Final = 0.1
@@ -159,7 +161,7 @@ def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | No
     if not distances:
         return None
     edge, nats = max(distances, key=lambda found: found[1])
-    return Contradiction(edge.source, edge.target, Check(float(np.sqrt(2.0 * nats)), float(np.sqrt(chdtri(6, TAIL)))))
+    return Contradiction(edge.source, edge.target, Check(float(np.sqrt(2.0 * nats)), float(np.sqrt(2.0 * TAIL_NATS))))
 
 
 def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
@@ -331,7 +333,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
                 beyond_m = _beyond(views[other], reaches_m[other], carried_m, turned)
                 found = np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
                 tally += found
-                free[column].append(_pixels(views[other], carried_m[found[0]]))
+                free[column].append(pixels_of(views[other], carried_m[found[0]]))
                 looks[[row, column]] += found.sum(axis=1)  # which of the two is wrong is unknown
         through, judged = tally[0], tally.sum(axis=0) >= 2
         absent[row] = np.sum(judged & (through >= 2) & (through > tally[1])), judged.sum()
@@ -377,7 +379,7 @@ def _nearest_around(view: RayImage) -> Array:
     return np.where(measured, near_m, np.nan)
 
 
-def _pixels(view: RayImage, points_m: Array) -> Array:
+def pixels_of(view: RayImage, points_m: Array) -> Array:
     """Return row and column (n, 2), whole numbers, at which points (n, 3) in front of a view's camera appear in it."""
     camera, (x, y, z) = view.frame.camera, points_m.T
     return np.rint(np.column_stack([camera.fy * y / z + camera.cy, camera.fx * x / z + camera.cx]))
@@ -394,7 +396,7 @@ def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> A
     """
     depth_m = points_m[:, 2]
     ahead = np.flatnonzero(_face_camera(points_m, normals) & (depth_m > 0.0))
-    rows, columns = _pixels(view, points_m[ahead]).T
+    rows, columns = pixels_of(view, points_m[ahead]).T
     height, width = near_m.shape
     inside = (columns >= _MARGIN_PX) & (columns < width - _MARGIN_PX)
     inside &= (rows >= _MARGIN_PX) & (rows < height - _MARGIN_PX)

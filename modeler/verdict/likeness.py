@@ -7,7 +7,7 @@ flat face matches, or all of one to within the tolerance.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -17,11 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 from modeler import se3
 from modeler.priors.general import LARGE_DEG
-from modeler.types import AbstractPrior, Array, Check, InputError, RayImage
+from modeler.types import AbstractPrior, Array, Check, InputError, RayImage, components
 from modeler.verdict.colour_fit import (
     AT_LEAST,
     FAR_DEG,
@@ -33,7 +32,7 @@ from modeler.verdict.colour_fit import (
     has_colour,
     places_in,
 )
-from modeler.verdict.evidence import MAX_POINTS, TAIL, TOLERANCE
+from modeler.verdict.evidence import MAX_POINTS, TAIL_NATS, TOLERANCE, pixels_of
 
 _CLEAR_DEG: Final = 30.0  # largest rotation at which print of right poses agrees: twelve captures have more than half
 _HALF: Final = 0.5  # of the correlation and of the contrast of prints that agree: less is neither agreement nor plain
@@ -112,8 +111,8 @@ def likenesses(
         matches = ((there, views[second].normals[some[second]]), (back, views[first].normals[some[first]]))
         beside, whole = np.min([_shares(*match) for match in matches], axis=0) if known else (1.0, 1.0)
         shaped = bool(beside >= _BESIDE or whole >= 1.0 - TOLERANCE)
-        one = Likeness(first, second, motion, there.mean(axis=0) if known else np.zeros(3), shaped)
-        one = replace(one, across=(first, second) in across)
+        normal = there.mean(axis=0) if known else np.zeros(3)
+        one = Likeness(first, second, motion, normal, shaped, across=(first, second) in across)
         comparable = NEAR_DEG <= angle_deg and (angle_deg <= FAR_DEG or one.across)
         if compared is not None and first in coloured and second in coloured and comparable:
             correlation, contrast = _print(compared, features, first, second)
@@ -132,13 +131,13 @@ def _matching(view: RayImage, other: RayImage, some: npt.NDArray[np.int64], moti
         motion: from the other camera to the view's.
         tolerance_m: distance within which surface matches.
     """
-    normals, camera = other.normals[some], view.frame.camera
+    normals, shape = other.normals[some], view.numbers.shape
     moved_m, turned = se3.transform(motion, other.points_m[some]), normals @ motion[:3, :3].T
     ahead = moved_m[:, 2] > 0.0
     moved_m, turned, normals = moved_m[ahead], turned[ahead], normals[ahead]
-    places = np.rint(moved_m[:, :2] / moved_m[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)).astype(int)
-    inside = ((places >= 0) & (places < (camera.width, camera.height))).all(axis=1)
-    numbers = np.where(inside, view.numbers[places[:, 1] * inside, places[:, 0] * inside], len(view.points_m))
+    pixels = pixels_of(view, moved_m).astype(int)
+    inside = np.all((pixels >= 0) & (pixels < shape), axis=1)
+    numbers = np.where(inside, view.numbers[tuple((pixels * inside[:, None]).T)], len(view.points_m))
     seen = numbers < len(view.points_m)
     there = numbers[seen]
     near = np.abs(view.points_m[there, 2] - moved_m[seen, 2]) <= tolerance_m
@@ -225,27 +224,24 @@ def flat_check(
     if not pairs:
         return None
     group = _groups(pairs, [pair for pair in pairs if pair.shaped or pair.correlation >= AT_LEAST])
-    if len(set(group.values())) > 1:
-        held = [
-            pair
-            for pair in pairs
-            if group[pair.first] == group[pair.second]
-            or not _has_rival(pair, views, abs(places[pair.second] - places[pair.first]), prior)
-        ]
-        group = _groups(pairs, [*held, *(pair for pair in pairs if pair.shaped or pair.correlation >= AT_LEAST)])
+    held = [
+        pair
+        for pair in pairs
+        if group[pair.first] == group[pair.second]
+        or not _has_rival(pair, views, abs(places[pair.second] - places[pair.first]), prior)
+    ]
+    group = _groups(pairs, held)
     numbers = list(group.values())
     largest = max(sorted(set(numbers)), key=numbers.count)
     loose = [frame for frame in group if group[frame] != largest]
     return (min(loose) if loose else min(group)), Check(float(len(loose)), 0.0)
 
 
-def _groups(pairs: Sequence[Likeness], joined: Iterable[Likeness]) -> dict[int, int]:
-    """Return a number of its group by frame number; pairs that are `joined` are of one group."""
-    group = {frame: frame for pair in pairs for frame in (pair.first, pair.second)}
-    for pair in joined:
-        old, new = group[pair.second], group[pair.first]
-        group = {frame: new if number == old else number for frame, number in group.items()}
-    return group
+def _groups(pairs: Sequence[Likeness], joined: Sequence[Likeness]) -> dict[int, int]:
+    """Return the number of its group by frame number; pairs that are `joined` are of one group."""
+    frames = np.unique([(pair.first, pair.second) for pair in pairs])
+    ends = np.array([(pair.first, pair.second) for pair in joined], dtype=np.int64).reshape(-1, 2)
+    return dict(zip(frames.tolist(), components(np.searchsorted(frames, ends), len(frames)).tolist(), strict=True))
 
 
 def _has_rival(pair: Likeness, views: Mapping[int, RayImage], steps: int, prior: AbstractPrior | None) -> bool:
@@ -269,17 +265,17 @@ def _has_rival(pair: Likeness, views: Mapping[int, RayImage], steps: int, prior:
         if abs(float(normal @ second.plane.normal)) > _UPRIGHT:
             return False
         axes = [second.plane.normal]
+    if steps > 1:
+        return True
     turns = Rotation.from_rotvec([sign * 0.5 * np.pi * axis for axis in axes for sign in (-1.0, 1.0)]).as_matrix()
     centre_m = second.centroid_m  # of what is seen: limits of offsets are those of its motion
     quarter = np.tile(np.eye(4), (len(turns), 1, 1))
     quarter[:, :3, :3], quarter[:, :3, 3] = turns, centre_m - turns @ centre_m
-    if steps > 1:
-        return True
     rivals = pair.motion @ quarter
     rivals = rivals[np.degrees(se3.rotation_angle(rivals)) <= LARGE_DEG]
     if prior is not None and len(rivals):
         with suppress(InputError):  # the prior does not apply: it was not used either
             density = (prior.unlimited() or prior).between(second, first)
-            least = float(density.log_prior(pair.motion[None])[0]) - 0.5 * float(chdtri(6, TAIL))
+            least = float(density.log_prior(pair.motion[None])[0]) - TAIL_NATS
             rivals = rivals[density.log_prior(rivals) >= least]
     return len(rivals) > 0

@@ -205,19 +205,37 @@ def summary(runs: Sequence[Run]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the study."""
-    parser = argparse.ArgumentParser(prog="python -m studies loops.cameras", description=__doc__)
+def asked(
+    study: str, description: str | None, arguments: Sequence[str] | None, *, per_class: int, out: Path
+) -> argparse.Namespace:
+    """Return the options of a study of turned shapes before cameras; without `--shapes`, those of its half.
+
+    Args:
+        study: as `python -m studies` takes it.
+        description: for the help.
+        arguments: of the command line; None: those of the process.
+        per_class: shapes of each class of symmetry, unless the user says how many.
+        out: file of the results likewise.
+    """
+    parser = argparse.ArgumentParser(prog=f"python -m studies {study}", description=description)
     parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
-    parser.add_argument("--per-class", type=int, default=2, metavar="N", help="shapes of each class of symmetry")
+    parser.add_argument(
+        "--per-class", type=int, default=per_class, metavar="N", help="shapes of each class of symmetry"
+    )
     parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=list(CAMERAS))
     parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these")
     parser.add_argument("--seed", type=int, default=0, help="of poses, noise and registration")
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--step-deg", type=float, default=24.0, help="mean turn from frame to frame")
-    parser.add_argument("--out", type=Path, default=Path("runs/cameras.json"), help="file of the results")
+    parser.add_argument("--out", type=Path, default=out, help="file of the results")
     options = parser.parse_args(arguments)
-    shapes = options.shapes or [one.recipe for one in chosen(options.half, options.per_class)]
+    options.shapes = options.shapes or [one.recipe for one in chosen(options.half, options.per_class)]
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study."""
+    options = asked("loops.cameras", __doc__, arguments, per_class=2, out=Path("runs/cameras.json"))
     runs = []
     print(
         f"{'camera':20}{'shape':22}{'ends':>3}{'model':>6}{'in':>4}{'deg':>7}{'mm':>6}{'F':>6}{'NEES':>7}{'95 %':>5}"
@@ -225,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         flush=True,
     )
     for name in options.cameras:
-        for shape in shapes:
+        for shape in options.shapes:
             runs.append(run(name, shape, options.seed, options.frames, options.step_deg))
             print(line(runs[-1]), flush=True)
     print(f"\n{summary(runs)}")

@@ -9,7 +9,6 @@ standard deviation.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -27,9 +26,9 @@ from modeler.export import write_atomically
 from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array
-from studies.calibration.by_camera import NOMINAL, chosen
+from studies.calibration.by_camera import NOMINAL
 from studies.calibration.depth_cameras import CAMERAS
-from studies.loops.cameras import Filmed
+from studies.loops.cameras import Filmed, asked
 from studies.loops.covariances import pushed
 from studies.trust.study import built
 
@@ -119,19 +118,10 @@ def table(rows: Sequence[Row]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
-    parser = argparse.ArgumentParser(prog="python -m studies surfacing.vertices", description=__doc__)
-    parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
-    parser.add_argument("--per-class", type=int, default=1, metavar="N", help="shapes of each class of symmetry")
-    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=list(CAMERAS))
-    parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these")
-    parser.add_argument("--seed", type=int, default=0, help="of poses, noise and registration")
-    parser.add_argument("--frames", type=int, default=16)
-    parser.add_argument("--step-deg", type=float, default=24.0, help="mean turn from frame to frame")
-    parser.add_argument("--out", type=Path, default=Path("runs/vertices.json"), help="file of the results")
-    options = parser.parse_args(arguments)
+    options = asked("surfacing.vertices", __doc__, arguments, per_class=1, out=Path("runs/vertices.json"))
     rows = []
     for name in options.cameras:
-        for shape in options.shapes or [one.recipe for one in chosen(options.half, options.per_class)]:
+        for shape in options.shapes:
             rows.append(row(name, shape, options.seed, options.frames, options.step_deg))
             print(rows[-1], file=sys.stderr, flush=True)
     options.out.parent.mkdir(parents=True, exist_ok=True)
