@@ -338,6 +338,10 @@ def test_the_table_states_every_pose_before_closure_and_after(run: list[Step], r
     after = sd_of(PoseGaussian(np.eye(4), last.solution.covariances[COUNT - 1]), newest)
     assert f"\N{RIGHTWARDS ARROW} {after.rotation_deg:.2g}**°" in rows[0]
     assert f"\N{RIGHTWARDS ARROW} {after.translation_mm:.2g}** mm" in rows[0]
+    # A frame that other edges place than that to the view before.
+    closed = [edge for edge in last.edges_so_far if (edge.source, edge.kind) != (COUNT - 1, "odometry")]
+    by_others = pose_table(replace(last, edges_so_far=tuple(closed)), {}, [COUNT - 1])
+    assert f"\N{RIGHTWARDS ARROW} {after.rotation_deg:.2g}**°" in by_others
     assert "No frame" in pose_table(replace(last, solution=Solution()), {}, [])
 
 

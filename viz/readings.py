@@ -236,13 +236,12 @@ def pose_table(step: Step, chain: Mapping[int, PoseGaussian], frames: Sequence[i
 def _pose_row(
     step: Step, frame: int, placed_by: Edge | None, chain: Mapping[int, PoseGaussian]
 ) -> tuple[str, str, str]:
-    """Return the rotation of a frame relative to the one it was registered to, and its standard deviations."""
-    if placed_by is None:
-        return ("first" if chain and frame == next(iter(chain)) else ""), "", ""
-    turned_rad = se3.rotation_angle(placed_by.posterior.pose.mean)
+    """Return the rotation of a frame relative to the one before, if registered to it, and its standard deviations."""
+    if chain and frame == next(iter(chain)):
+        return "first", "", ""
     before, after = _pose_sd(step, frame, chain.get(frame)), _pose_sd(step, frame, _solved(step, frame))
     return (
-        f"{math.degrees(float(turned_rad)):.1f}°",
+        "" if placed_by is None else f"{math.degrees(float(se3.rotation_angle(placed_by.posterior.pose.mean))):.1f}°",
         _change(before.rotation_deg, after.rotation_deg, "°"),
         _change(before.translation_mm, after.translation_mm, " mm"),
     )
