@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 from command_runner import FILES
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from source_trees import ROOT
 
 LINUX_ONLY = ("sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "copy_file_range", "pipe2")
@@ -57,12 +59,21 @@ sys.exit(main(sys.argv[2:]))
 def with_requirements(names: set[str]) -> set[str]:
     """Return distributions with all that they require."""
     required = {
-        re.split(r"[^\w.-]", requirement)[0].lower().replace("_", "-")
+        canonicalize_name(requirement.name)
         for name in names
-        for requirement in metadata.requires(name) or ()
-        if "extra ==" not in requirement and "python_version <" not in requirement
+        for requirement in map(Requirement, metadata.requires(name) or ())
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""})
     }
     return names if required <= names else with_requirements(names | required)
+
+
+def test_only_what_this_system_needs_is_required(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = {
+        "a": ["B_c>=1", 'colorama; platform_system == "Windows"', "win; sys_platform == 'win32' and extra == 'all'"],
+        "b-c": None,
+    }
+    monkeypatch.setattr(metadata, "requires", listed.__getitem__)  # raises for a package that is not there
+    assert with_requirements({"a"}) == {"a", "b-c"}
 
 
 def test_the_demonstration_runs_on_what_is_installed_for_it(scene: Path, tmp_path: Path) -> None:
