@@ -23,6 +23,7 @@ RECIPE = {
 }
 
 
+@pytest.mark.slow
 def test_a_robot_turns_the_object_as_suggested_and_leaves_a_run(
     cli: Run, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

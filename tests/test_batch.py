@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from command_runner import QUICK, Run
 from fake_builder import PATIENCE_S, book, run_here, sequence, started, wait_for
+from slow_cases import quick_first
 
 from modeler.batch import engines, jobs
 from modeler.batch.jobs import NOTES, Job, fingerprint, standing
@@ -308,7 +309,7 @@ def alive(out: Path) -> set[int]:
     return set(filter(running, pids))
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL])
+@pytest.mark.parametrize("how", quick_first([signal.SIGKILL, signal.SIGINT, signal.SIGTERM]))
 def test_what_is_interrupted_loses_a_pair_of_each_sequence_at_most(
     cli: Run, tmp_path: Path, how: signal.Signals
 ) -> None:

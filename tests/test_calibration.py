@@ -110,6 +110,7 @@ class Looking(AbstractRegistrar):
         return _posterior(PoseGaussian(np.eye(4), np.eye(6)))
 
 
+@pytest.mark.slow
 def test_a_blind_study_leaves_out_colour_alone() -> None:
     seen: list[RayImage] = []
     study = Study(conditions=(Condition(),), priors={"table": TablePrior()}, methods={OURS: Looking(seen)})
@@ -219,6 +220,7 @@ def test_only_answers_that_are_given_are_judged() -> None:
     assert coverage_curves(panels([BLANK])).startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_study_runs_and_repeats_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quick = AdaptiveSampler(samples=250)
     box = Specimen("box", "n-fold", "tuning")

@@ -276,6 +276,7 @@ def test_a_program_that_calls_a_command_handles_its_signals_again(
     capfd.readouterr()
 
 
+@pytest.mark.slow
 def test_settings_for_developers_of_libraries_change_nothing(
     scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ import threading
 import time
 
 import pytest
+from slow_cases import quick_first
 
 from modeler.cli import main
 from modeler.sequences import bundled
@@ -122,7 +123,7 @@ def test_a_parallel_map_keeps_the_order_and_does_not_start_the_rest_once_closed(
     assert list(parallel_map(make, range(4))) == [0, -1, -2, -3]
 
 
-@pytest.mark.parametrize("method", ["spawn", "forkserver", "fork"])
+@pytest.mark.parametrize("method", quick_first(["spawn", "forkserver", "fork"]))
 def test_processes_register_however_they_are_started(method: str) -> None:
     """Also where this process has registered before, and runs threads."""
     command = ["register", str(bundled("box")), "0", "1", "--prior", "table", "--method", "icp"]

@@ -136,6 +136,7 @@ def test_the_study_by_camera_runs_and_repeats_itself(tmp_path: Path, capsys: pyt
     assert "no pair is left" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_whole_runs_of_a_camera_are_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

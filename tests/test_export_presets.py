@@ -12,6 +12,7 @@ import trimesh
 from command_runner import Run
 from run_builders import ball
 from scipy.spatial.transform import Rotation
+from slow_cases import quick_first
 
 from modeler import se3
 from modeler.export import solids
@@ -285,15 +286,18 @@ def test_both_bop_exports_have_one_frame(cli: Run, built: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("purpose", "name", "files"),
-    [
-        ("foundationpose", "fp", {"model.obj", "model.mtl", "model.png", "model.obj.pose.json"}),
-        ("print", "solid", {"model.stl", "model.stl.pose.json"}),
-        ("mujoco", "mj", {"mj.xml", "scene.xml", "visual.obj", "visual.obj.pose.json"}),
-        ("urdf", "ur", {"ur.urdf", "visual.obj", "visual.obj.pose.json"}),
-        ("isaac", "is", {"is.usd", "is.usd.pose.json"}),
-        ("gazebo", "gz", {"model.sdf", "model.config", "visual.obj", "visual.obj.pose.json"}),
-        ("bop", "bop", {"models", "onboarding_static"}),
-    ],
+    quick_first(
+        [
+            ("foundationpose", "fp", {"model.obj", "model.mtl", "model.png", "model.obj.pose.json"}),
+            ("print", "solid", {"model.stl", "model.stl.pose.json"}),
+            ("mujoco", "mj", {"mj.xml", "scene.xml", "visual.obj", "visual.obj.pose.json"}),
+            ("isaac", "is", {"is.usd", "is.usd.pose.json"}),
+            ("urdf", "ur", {"ur.urdf", "visual.obj", "visual.obj.pose.json"}),
+            ("gazebo", "gz", {"model.sdf", "model.config", "visual.obj", "visual.obj.pose.json"}),
+            ("bop", "bop", {"models", "onboarding_static"}),
+        ],
+        4,
+    ),
 )
 def test_every_preset_ends_with_what_was_checked(
     cli: Run, built: Path, tmp_path: Path, purpose: str, name: str, files: set[str]

@@ -36,7 +36,7 @@ NOT_HERE = {
     r"--device cuda": "needs a GPU",
 }
 """What commands ask for that a test has not: they are only understood."""
-QUICK = ("README", "build")
+QUICK = ("README",)
 SEQUENCES = "sequences/bundled/box sequences/bundled/tube turned poked carried shelf/cup shelf/tin".split()
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 WITH_COMMANDS = (*PAGES.values(), DOCS / "measurements.md", DOCS / "results.md", CONTRIBUTING)

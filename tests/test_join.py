@@ -164,6 +164,7 @@ def test_the_recording_shows_a_pair_of_views_that_joins_the_runs(
     np.testing.assert_allclose(moved[0].mean(axis=0), expected.mean(axis=0), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_exports_made_anew_from_the_frames(
     runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from slow_cases import quick_first
 
 from modeler import kernels
 from modeler.cli.console import say
@@ -70,7 +71,7 @@ def test_a_kernel_is_compiled_once(toy: Path) -> None:
     assert not list(toy.glob("home/**/kernels-*"))
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", quick_first([True, False]))
 def test_a_kernel_is_compiled_again_once_a_function_inlined_in_it_has_changed(toy: Path, own: bool) -> None:
     settings = {"NUMBA_CACHE_DIR": str(toy / "elsewhere")} if own else {}
     assert called(toy, **settings)[0] == "2.0"
@@ -107,7 +108,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("damage", quick_first(DAMAGES))
 def test_damaged_kernels_are_compiled_again(toy: Path, damage: str) -> None:
     called(toy)
     whole = {path: path.read_bytes() for path in files(toy)}
@@ -124,7 +125,7 @@ def test_kernels_of_other_settings_are_not_taken(toy: Path) -> None:
     assert int(called(toy, NUMBA_OPT="1")[1]) > 0
 
 
-@pytest.mark.parametrize("place", ["/dev/null/kernels", "/proc/kernels"])
+@pytest.mark.parametrize("place", quick_first(["/dev/null/kernels", "/proc/kernels"]))
 def test_where_nothing_can_be_written_kernels_stay_in_memory(toy: Path, place: str) -> None:
     assert called(toy, NUMBA_CACHE_DIR=place, HOME=place, TMPDIR=place)[::3] == ["2.0", "False"]
     assert not files(toy)

@@ -142,6 +142,7 @@ def test_a_run_that_cannot_be_judged_is_left_out_and_the_others_are_judged(
     assert not (out / "models.json").exists()
 
 
+@pytest.mark.slow
 def test_another_sequence_is_not_taken_for_that_of_the_run(scene: Path, built: Path, tmp_path: Path, cli: Run) -> None:
     sequence, run = _without(scene, built, tmp_path)
     moved = sequence.rename(tmp_path / "moved")
@@ -205,6 +206,7 @@ def test_a_damaged_report_is_one_line(
         assert "build the run again" in err
 
 
+@pytest.mark.slow
 def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
     built: Path, tmp_path: Path, cli: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

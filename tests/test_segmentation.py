@@ -10,6 +10,7 @@ from input_errors import refused
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from segmentation_worlds import CAMERA, OBJECT, World, iou
+from slow_cases import quick_first
 
 from modeler.segmentation import DepthNoise, Scene, Segmenter
 from modeler.segmentation.depth_images import (
@@ -609,13 +610,16 @@ def test_table_of_rendered_sequences(name):
 @pytest.mark.skipif(not REAL.exists(), reason="the real sequences are not here")
 @pytest.mark.parametrize(
     ("name", "pixels", "object_px"),
-    [
-        ("cap", (16000, 21000), (300, 230)),
-        ("kleenex", (11000, 16500), (315, 260)),
-        ("castard", (38000, 75000), (345, 250)),
-        ("dog_upright", (19000, 27000), (350, 200)),
-        ("figure", (19000, 38000), (315, 240)),
-    ],
+    quick_first(
+        [
+            ("cap", (16000, 21000), (300, 230)),
+            ("figure", (19000, 38000), (315, 240)),
+            ("kleenex", (11000, 16500), (315, 260)),
+            ("castard", (38000, 75000), (345, 250)),
+            ("dog_upright", (19000, 27000), (350, 200)),
+        ],
+        2,
+    ),
 )
 def test_real_sequences(name, pixels, object_px):
     """Sizes and places are those of masks that were looked at, frame by frame."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tabletop
+from slow_cases import quick_first
 
 from modeler import se3
 from modeler.cli import main
@@ -48,7 +49,7 @@ def estimate(stated: float, *, closed: bool = True) -> FocalLength:
     return FocalCalibrator().estimate(views, chain, SENSOR, MODELER.register, MODELER.prior)
 
 
-@pytest.mark.parametrize("stated", [0.93, 1.0, pytest.param(1.06, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stated", quick_first([0.93, 1.0, 1.06]))
 def test_a_closed_turn_tells_the_focal_length(stated: float) -> None:
     found = estimate(stated)
     assert found.told_by == "loop"

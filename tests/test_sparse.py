@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from slow_cases import quick_first
 
 from modeler.evaluation import nees, rotation_error_deg, true_motion
 from modeler.fusion import Fuser
@@ -105,7 +106,7 @@ def segmented(frames):
     return [Segmenter().segment(frame, scene) for frame in frames]
 
 
-@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("masked", quick_first([False, True]))
 def test_sparse_frames_show_the_object_and_its_support_as_dense_ones_do(drill, masked, rng):
     dense = [drill.frame(index) if masked else replace(drill.frame(index), mask=None) for index in drill.indices]
     sparse = [thinned(frame, 0.1, rng) for frame in dense]
@@ -118,7 +119,7 @@ def test_sparse_frames_show_the_object_and_its_support_as_dense_ones_do(drill, m
         assert np.count_nonzero(got.mask & want.mask) > 0.8 * np.count_nonzero(got.mask | want.mask)
 
 
-@pytest.mark.parametrize(("share", "worst_deg"), [(0.1, 10.0), (0.03, 30.0)])
+@pytest.mark.parametrize(("share", "worst_deg"), quick_first([(0.03, 30.0), (0.1, 10.0)]))
 def test_sparse_views_are_registered_as_well_as_they_state(drill, share, worst_deg):
     indices, sensor, squares = drill.indices[:2], Sensor(drill.sensor()), []
     truth = true_motion(drill.truth(), *indices)

@@ -23,6 +23,7 @@ from urllib.parse import unquote
 import pytest
 import rerun.chunk
 from rerun_recordings import read, record
+from slow_cases import quick_first
 from turning_box import COUNT
 
 from modeler.types import Step
@@ -166,7 +167,7 @@ def streamed(path: Path, *options: str, status: int = 0) -> str:
     return ended.stderr
 
 
-@pytest.mark.parametrize("short", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("short", quick_first([0.99, 0.9, 0.5]))
 def test_a_disk_that_fills_at_any_piece_does_not_hold_the_process(
     run: list[Step], tmp_path: Path, short: float
 ) -> None:
@@ -182,6 +183,7 @@ def test_a_viewer_that_accepts_and_stays_silent_does_not_hold_the_process(tmp_pa
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0, 1}
 
 
+@pytest.mark.slow
 def test_a_signal_while_a_silent_viewer_is_waited_for_ends_the_process(tmp_path: Path) -> None:
     began_s = time.monotonic()
     streamed(tmp_path / "r.rrd", "0", "watched", "ended", status=128 + signal.SIGHUP)
@@ -337,7 +339,7 @@ def test_a_recording_is_served_to_this_machine_alone_and_quietly(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", quick_first([signal.SIGINT, signal.SIGTERM]))
 def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp_path: Path, number: int) -> None:
     record(tmp_path / "recording.rrd", run[:1])
     program = (
