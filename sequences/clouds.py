@@ -17,7 +17,7 @@ from typing import BinaryIO, Final, Literal, final
 import numpy as np
 import numpy.typing as npt
 
-from modeler.sequences.file_names import frame_numbers
+from modeler.sequences.file_names import frame_numbers, said_of_angles
 from modeler.sequences.image_files import MAX_PIXELS
 from modeler.sequences.input_files import input_errors, list_images
 from modeler.sequences.intrinsics import Intrinsics, Overrides, find_intrinsics, sane
@@ -144,7 +144,8 @@ def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
             refused.append(error)
             continue
         camera, (unit_mm, who) = Camera(columns, rows, *intrinsics), _unit_mm(turned, overrides)
-        return CloudSequence(path, clouds, unit_mm, who, camera, axes, first.size[1] > 1, (*_SAID[axes], *remarks))
+        said = (*_SAID[axes], *remarks, *said_of_angles(clouds))
+        return CloudSequence(path, clouds, unit_mm, who, camera, axes, first.size[1] > 1, said)
     raise refused[0]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -39,6 +41,18 @@ def _differences(stems: list[str]) -> list[str]:
     return [row[differ[0]] for row in rows] if counted else []
 
 
+def said_of_angles(numbers: Iterable[int]) -> tuple[str, ...]:
+    """Say so if frame numbers look like a turntable's angles in degrees: equal steps around a whole turn."""
+    places = sorted(numbers)
+    step = math.gcd(*(after - before for before, after in itertools.pairwise(places)))
+    if not 1 < step <= _WIDEST_STEP or places[-1] - places[0] not in (360 - step, 360) or 360 % step:
+        return ()
+    return (
+        f"frame numbers look like angles, in steps of {step}°; if they are, give `prior` turntable and `step_deg` 1",
+    )
+
+
+_WIDEST_STEP: Final = 90  # degrees: views that are farther apart have no surface in common
 _STAMP_DIGITS: Final = 10
 _STAMP: Final = re.compile(
     r"(?<![0-9])(1[0-9]{9}|1[0-9]{12}|1[0-9]{15}|1[0-9]{18}|6[0-9]{17})(?![0-9])(?:[._]([0-9]{1,9}))?"

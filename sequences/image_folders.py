@@ -21,7 +21,7 @@ from modeler.sequences.depth_files import (
     no_depth,
     read_depth,
 )
-from modeler.sequences.file_names import frame_numbers, partners, role_of, stamps_s
+from modeler.sequences.file_names import frame_numbers, partners, role_of, said_of_angles, stamps_s
 from modeler.sequences.image_files import (
     COLOUR_SUFFIXES,
     MASK_SUFFIXES,
@@ -294,7 +294,7 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
     facts = facts.scaled(size)
     numbers = frame_numbers(list(depth)) or {stem: place for place, stem in enumerate(depth)}
     times_s = stamps_s(list(depth)) or {}
-    remarks = facts.remarks(size)
+    remarks = [*facts.remarks(size), *said_of_angles(numbers.values())]
     roles = {
         "colour images": found.colour,
         "masks": found.masks,

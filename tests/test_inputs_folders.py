@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +11,10 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from modeler.cli import main
 from modeler.segmentation import Segmenter
 from modeler.sequences import Overrides, open_sequence, survey
+from modeler.sequences.file_names import said_of_angles
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import raw_depth, save
 from studies.formats.other_programs import CAMERAS, DEPTHS, LENS, NAMES, distorted, exr, write_camera
@@ -98,6 +100,34 @@ def test_names_state_what_images_are(tmp_path: Path, frames: list[Frame], kind: 
             assert np.count_nonzero(read.mask ^ wrote.mask) <= 0.02 * np.count_nonzero(wrote.mask)
     if kind == "ticks":
         np.testing.assert_allclose(np.diff([frame.time_s for frame in sequence]), 0.5, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "step"),
+    [
+        (range(0, 360, 24), 24),
+        (range(0, 361, 30), 30),
+        ([0, 45, 90, 180, 225, 270, 315], 45),  # one of them is missing
+        (range(0, 360), None),
+        (range(0, 150, 10), None),
+        (range(0, 400, 8), None),
+    ],
+)
+def test_names_that_look_like_angles_are_said_to(numbers: Sequence[int], step: int | None) -> None:
+    said = said_of_angles(numbers)
+    assert said == () if step is None else f"in steps of {step}°" in said[0]
+
+
+def test_a_step_is_asked_for_with_what_the_names_imply(
+    tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for angle in range(0, 360, 60):
+        save(tmp_path / "depth" / f"{angle}.png", raw_depth(frames[0], 1.0))
+    write_camera(tmp_path, frames[0].camera)
+    looks = "frame numbers look like angles, in steps of 60°; if they are, give `prior` turntable and `step_deg` 1"
+    assert looks in open_sequence(tmp_path).notes
+    assert main(["register", str(tmp_path), "60", "0", "--prior", "turntable"]) == 2
+    assert "in steps of 60°; if they are, give --prior turntable and --step-deg 1)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", CAMERAS)

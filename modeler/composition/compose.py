@@ -35,6 +35,7 @@ from modeler.priors import (
 from modeler.priors.checks import ParameterError
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.sequences import AbstractSequence
+from modeler.sequences.file_names import said_of_angles
 from modeler.sequences.hand_shapes import hand_poses
 from modeler.sequences.input_files import frame_number
 from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError, SensorNoise
@@ -281,7 +282,9 @@ def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) 
         case "table":
             return TablePrior(**given, limits_assumed=not given)
         case "turntable":
-            return _turntable(given, {} if sequence is None else sequence.motion or {})
+            if sequence is None:
+                return _turntable(given, {}, ())
+            return _turntable(given, sequence.motion or {}, () if sequence.live else sequence.indices)
         case "held":
             return _held(given, sequence)
         case "poke":
@@ -352,7 +355,7 @@ def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPr
     return VelocityPrior(known, **given) if name == "velocity" else FeaturesPrior(known)
 
 
-def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> TurntablePrior:
+def _turntable(given: dict[str, Any], motion: Mapping[str, object], indices: Sequence[int]) -> TurntablePrior:
     """Return a turntable, its step as given, else from `sequence.json`.
 
     A step given without an axis leaves its sign unknown, unless it is negative or agrees with the file.
@@ -361,7 +364,8 @@ def _turntable(given: dict[str, Any], motion: Mapping[str, object]) -> Turntable
     given = dict(given)
     if "step_deg" not in given:
         if not step_deg:
-            raise InputError("`prior` turntable needs the rotation from frame to frame; give `step_deg`")
+            looks = "".join(f" ({said})" for said in said_of_angles(indices))
+            raise InputError(f"`prior` turntable needs the rotation from frame to frame; give `step_deg`{looks}")
         given["step_deg"] = step_deg
         if sigma_deg is not None and sigma_deg > 0.0:
             given.setdefault("step_sigma_deg", sigma_deg)
