@@ -69,8 +69,14 @@ RECIPE = Recipe(
 )
 
 
-def edge(source: int, target: int, kind: EdgeKind = "odometry", pose: Array | None = None) -> Edge:
-    gaussian = PoseGaussian(np.eye(4) if pose is None else pose, 1e-6 * np.eye(6))
+def edge(
+    source: int,
+    target: int,
+    kind: EdgeKind = "odometry",
+    pose: Array | None = None,
+    covariance: Array | None = None,
+) -> Edge:
+    gaussian = PoseGaussian(np.eye(4) if pose is None else pose, 1e-6 * np.eye(6) if covariance is None else covariance)
     return Edge(Posterior(source, target, gaussian, Outcome.CONVERGED, overlap=0.8), kind, True, Stated("made up"))
 
 
@@ -135,13 +141,12 @@ def test_a_right_alignment_does_not_pay_for_poses_that_err_within_segments(bend:
     true = tabletop.trajectory(poses)
     bent = {k: true[0] @ se3.exp(bend * se3.log(se3.inverse(true[0]) @ pose)) for k, pose in true.items()}
     parts = Segment(views, Solution(bent), ()), Segment(moved, Solution({k + 6: bent[k] for k in bent}), ())
-    assert Joiner().likelihoods(*parts, np.eye(4)[None])[0] > 0.0
+    assert Joiner().likelihoods(*parts, [Alignment(np.eye(4))])[0] > 0.0
 
 
-@pytest.mark.parametrize(("first", "last"), [(range(9), range(6, 15)), (range(3), range(4, 7))])
-def test_sessions_that_share_few_views_are_held_against_pairs_that_share_as_little(first: range, last: range) -> None:
-    """Print that agrees gains much in near views; views of two sessions are farther apart than those of one."""
-    rng, poses, sensor = np.random.default_rng(0), tabletop.turntable(16), Sensor(SensorNoise(1e-3, 1e-3))
+def printed_views(poses: list[Array]) -> dict[int, RayImage]:
+    """Return views of a brick with print."""
+    rng, sensor = np.random.default_rng(0), Sensor(SensorNoise(1e-3, 1e-3))
     waves, phases = rng.normal(scale=300.0, size=(20, 3)), rng.uniform(0.0, 2.0 * np.pi, 20)
     views = {}
     for k, one in tabletop.views(tabletop.BRICK, poses).items():
@@ -151,7 +156,14 @@ def test_sessions_that_share_few_views_are_held_against_pairs_that_share_as_litt
         grey = np.clip(grey + rng.normal(size=grey.shape), 0.0, 255.0).astype(np.uint8)
         colour = np.ascontiguousarray(np.broadcast_to(grey[..., None], (*grey.shape, 3)))
         views[k] = sensor.ray_image(replace(one.frame, colour=colour))
-    true = tabletop.trajectory(poses)
+    return views
+
+
+@pytest.mark.parametrize(("first", "last"), [(range(9), range(6, 15)), (range(3), range(4, 7))])
+def test_sessions_that_share_few_views_are_held_against_pairs_that_share_as_little(first: range, last: range) -> None:
+    """Print that agrees gains much in near views; views of two sessions are farther apart than those of one."""
+    poses = tabletop.turntable(16)
+    views, true = printed_views(poses), tabletop.trajectory(poses)
     parts = (
         Segment({k: views[k] for k in first}, Solution({k: true[k] for k in first}), ()),
         Segment({k + 16: shifted(views[k], k + 16) for k in last}, Solution({k + 16: true[k] for k in last}), ()),
@@ -159,6 +171,33 @@ def test_sessions_that_share_few_views_are_held_against_pairs_that_share_as_litt
     turns = [np.zeros(6), *np.pi * np.eye(6)[[0, 2]]]  # a brick fits its hull upside down and the other way round
     found = [Joiner().is_consistent(*parts, Alignment(se3.exp(turn))) for turn in turns]
     assert found == [True, False, False]
+
+
+def test_sessions_that_are_bent_are_compared_as_they_are_once_joined() -> None:
+    """Steps that are 2 % too long add up along a session; upside down, less surface is shared that suffers by it."""
+    poses = tabletop.turntable(16)
+    views, true = printed_views(poses), tabletop.trajectory(poses)
+    bent = {0: true[0]}
+    for k in range(15):
+        bent[k + 1] = bent[k] @ se3.exp(1.02 * se3.log(se3.inverse(true[k]) @ true[k + 1]))
+    about_body = np.diag(np.repeat([8e-3, 1e-3], 3) ** 2)
+    bent_parts = []
+    for offset, frames in ((0, range(9)), (16, range(6, 15))):
+        steps = []
+        for k in frames[:-1]:
+            adjoint = se3.adjoint(se3.inverse(bent[k + 1]))
+            covariance = adjoint @ about_body @ adjoint.T
+            steps.append(edge(k + 1 + offset, k + offset, "odometry", se3.inverse(bent[k]) @ bent[k + 1], covariance))
+        placed = Solution({k + offset: bent[k] for k in frames})
+        bent_parts.append(Segment({k + offset: shifted(views[k], k + offset) for k in frames}, placed, tuple(steps)))
+    parts = bent_parts[0], bent_parts[1]
+    joiner = Joiner(pairs=4)
+    ways = [joiner._registered(*parts, se3.exp(turn)) for turn in [np.pi * np.eye(6)[0], np.zeros(6)]]
+    found = joiner.weighted(*parts, ways)
+    assert found[0].target_from_source is ways[1].target_from_source
+    assert found[0].share > 0.999
+    assert joiner.is_consistent(*parts, found[0])
+    assert joiner.likelihoods(*parts, [found[0]]) > joiner.likelihoods(*parts, [replace(found[0], trajectory=None)])
 
 
 @pytest.mark.parametrize(("sigma_deg", "accepted"), [(1.0, True), (5.0, False)])

@@ -18,6 +18,7 @@ from scipy.special import chdtri
 from modeler import se3
 from modeler.closure.consistency import widest_rotation
 from modeler.fusion import Fuser, FusionVolume, Matcher, conditional_covariances
+from modeler.graph import PoseGraph, solve
 from modeler.pipeline.pairs import Registrations
 from modeler.priors.general import AnyMotion
 from modeler.priors.mixtures import KernelMixture
@@ -43,7 +44,9 @@ _OPEN_SHARE = 0.5  # of the first: with more, the images add less than three tim
 _MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment; beyond, it is at another mode
 _MAX_VIEWS: Final = 20  # of a segment, compared with as many of the other
 _COARSE_VOXELS: Final = 64**3  # of models to align
-_MAX_ALIGNMENTS: Final = 4  # about which pairs of views are registered
+_MIN_ALIGNMENTS: Final = 4  # about which pairs of views are registered
+_MAX_ALIGNMENTS: Final = 24  # as many ways has a cube to match its shape, of which print tells one
+_CLOSE_NATS: Final = 10.0  # to the likeliest: registering gains a right alignment up to 5, and others are 50 below
 _TAIL: Final = 0.01  # probability of rejecting a true alignment
 MIN_JOINS: Final = 2
 """Pairs of views that must agree on an alignment: nothing confirms a single one."""
@@ -85,6 +88,9 @@ class Alignment:
     """Probability (0..1), given that one of the alignments found is right."""
     edges: tuple[Edge, ...] = ()
     """Pairs of views registered about it, accepted or rejected."""
+    trajectory: Mapping[int, Array] | None = None
+    """Poses (4, 4) of all cameras in that of the first view, by frame number, as the graph with its edges has them.
+    None: as each segment has them."""
 
     @property
     def accepted(self) -> int:
@@ -123,41 +129,45 @@ class Joiner:
     def is_consistent(self, target: Segment, source: Segment, alignment: Alignment) -> bool:
         """Return whether views of two segments fit each other as well as those of one segment that share as much do.
 
-        The tolerance is the chance deviation of the misfits of independent measurements, as many as a pair has for each
-        view of the smaller segment (method, eq. 11.2).
+        Surface and colours must each do so: print that agrees does not make up for surface that does not. The tolerance
+        is the chance deviation of the misfits of independent measurements, as many as a pair has for each view of the
+        smaller segment (method, eq. 11.2).
         """
         count = min(_MAX_VIEWS, len(target.frames), len(source.frames))
         freedom = count * self._independent(target, source)
         allowed = 0.5 * (float(chdtri(freedom, _TAIL)) - freedom) / count
-        found, shared = self._across(target, source, alignment.target_from_source[None])[..., 0]
-        within, own = self._within(target, source)
+        *found, shared = self._across(target, source, [alignment])[..., 0]
+        *within, own = self._within(target, source)
         order = np.argsort(own, kind="stable")
-        alike = np.interp(shared, [0.0, *own[order]], [0.0, *within[order]])  # without common surface nothing is gained
-        return float(np.mean(found - alike)) >= -allowed
+        # Without common surface nothing is gained.
+        alike = [np.interp(shared, [0.0, *own[order]], [0.0, *part[order]]) for part in within]
+        return bool(np.mean(np.subtract(found, alike), axis=1).min() >= -allowed)
 
-    def likelihoods(self, target: Segment, source: Segment, poses: Array) -> Array:
-        """Return the log-likelihoods (n,) in nats of alignments (n, 4, 4), means over pairs of views (eq. 11.1).
+    def likelihoods(self, target: Segment, source: Segment, alignments: Sequence[Alignment]) -> Array:
+        """Return the log-likelihoods (n,) in nats of alignments, means over pairs of views (eq. 11.1).
 
-        Poses within a segment err, too, so that right pairs of views pay, the more the more surface they share. Pairs
-        that share none pay nothing: without that price an alignment would gain by sharing less.
+        Poses within a segment err, too, so that surface of right pairs of views costs, the more the more they share.
+        Pairs that share none pay nothing: without that price an alignment would gain by sharing less. What print gains
+        within segments is no part of the price: where it does not agree, nothing is gained.
         """
-        log_likelihood, shared = self._across(target, source, poses).mean(axis=1)
-        within, own = self._within(target, source).mean(axis=1)
-        return np.asarray(log_likelihood - (min(within / own, 0.0) if own > 0.0 else 0.0) * shared)
+        surface, colours, shared = self._across(target, source, alignments).mean(axis=1)
+        within, _, own = self._within(target, source).mean(axis=1)
+        return np.asarray(surface + colours - (min(within / own, 0.0) if own > 0.0 else 0.0) * shared)
 
     def weighted(self, target: Segment, source: Segment, alignments: Sequence[Alignment]) -> list[Alignment]:
         """Return alignments with their likelihoods and probabilities, likeliest first.
 
         Views of one segment see the same surface, so that pairs are not independent: each view counts as if compared
-        with one view of the other segment, not with all.
+        with one view of the other segment, not with all. Beside alignments on which pairs agree, others are impossible.
         """
         if not alignments:
             return []
-        poses = np.stack([alignment.target_from_source for alignment in alignments])
-        scores = self.likelihoods(target, source, poses)
-        shares = np.exp(min(_MAX_VIEWS, len(target.frames), len(source.frames)) * (scores - scores.max()))
+        scores = self.likelihoods(target, source, alignments)
+        agreed = np.array([alignment.accepted >= MIN_JOINS for alignment in alignments])
+        ranks = np.where(agreed | ~agreed.any(), scores, -np.inf)
+        shares = np.exp(min(_MAX_VIEWS, len(target.frames), len(source.frames)) * (ranks - ranks.max()))
         shares /= shares.sum()
-        order = np.argsort(-scores, kind="stable")
+        order = np.argsort(-ranks, kind="stable")
         return [replace(alignments[k], log_likelihood=float(scores[k]), share=float(shares[k])) for k in order]
 
     def _refined(
@@ -168,10 +178,12 @@ class Joiner:
         Proposals near known alignments are not registered again.
         """
         found = [*known]
-        for alignment in self.weighted(target, source, [Alignment(pose) for pose in proposed]):
-            if len(found) < len(known) + _MAX_ALIGNMENTS and not any(_near(alignment, other) for other in found):
-                edges = self._edges(target, source, alignment.target_from_source)
-                found.append(Alignment(_mean_pose(target, source, edges, alignment.target_from_source), edges=edges))
+        candidates = self.weighted(target, source, [Alignment(pose) for pose in proposed])
+        for alignment in candidates:
+            close = alignment.log_likelihood >= candidates[0].log_likelihood - _CLOSE_NATS
+            most = len(known) + (_MAX_ALIGNMENTS if close else _MIN_ALIGNMENTS)
+            if len(found) < most and not any(_near(alignment, other) for other in found):
+                found.append(self._registered(target, source, alignment.target_from_source))
         distinct: list[Alignment] = []
         for alignment in self.weighted(target, source, found):
             if not any(_near(alignment, other) for other in distinct):
@@ -183,6 +195,20 @@ class Joiner:
         reason = JoinsSegments(distinct[0].share, rival_deg)
         edges = tuple(replace(edge, reason=reason) if edge.accepted else edge for edge in distinct[0].edges)
         return [replace(distinct[0], edges=edges), *distinct[1:]]
+
+    def _registered(self, target: Segment, source: Segment, target_from_source: Array) -> Alignment:
+        """Return an alignment (4, 4), refined by registering pairs of views, and the poses of the graph with them.
+
+        Segments are bent by errors that add up along them, within which right pairs agree and wrong ones do not.
+        """
+        edges = self._edges(target, source, target_from_source)
+        found = Alignment(_mean_pose(target, source, edges, target_from_source), edges=edges)
+        if not found.accepted:
+            return found
+        poses, first = _placed(target, source, found), target.frames[0]
+        graph = PoseGraph((*target.edges, *source.edges, *edges), first=first)
+        solved = solve(graph, {frame: se3.inverse(poses[first]) @ pose for frame, pose in poses.items()}).trajectory
+        return replace(found, trajectory=solved) if solved.keys() >= poses.keys() else found
 
     def _by_models(self, target: Segment, source: Segment) -> list[Array]:
         """Return alignments (4, 4) of the models of two segments."""
@@ -254,32 +280,33 @@ class Joiner:
         return Edge(posterior, "join", True, JoinsSegments(1.0, 0.0))
 
     def _nats(self, source: RayImage, target: RayImage, poses: Array) -> Array:
-        """Return log-likelihoods of poses (n, 4, 4) of a pair of views, and the shares (0..1) of surface seen in both.
+        """Return log-likelihoods of surface and colours at poses (n, 4, 4) of a pair of views, and the shares E (0..1).
 
-        (2, n). Without the cost of no overlap, because views from opposite sides have none.
+        (3, n). Without the cost of no overlap, because views from opposite sides have none.
         """
         pair = self._pair(source, target)
         found = pair.scores(poses, self._search.fine_m(pair), stride=1)
-        return np.stack([pair.temper * found.surface + found.colours, found.explained])
+        return np.stack([pair.temper * found.surface, found.colours, found.explained])
 
-    def _across(self, target: Segment, source: Segment, poses: Array) -> Array:
-        """Return as `_nats` (2, m, n) the m pairs of views, one of each segment, for alignments (n, 4, 4)."""
+    def _across(self, target: Segment, source: Segment, alignments: Sequence[Alignment]) -> Array:
+        """Return as `_nats` (3, m, n) the m pairs of views, one of each segment, for n alignments."""
         targets, sources = self._spread(target, _MAX_VIEWS), self._spread(source, _MAX_VIEWS)
+        placed = [_placed(target, source, alignment) for alignment in alignments]
         found = [
-            self._nats(other, view, se3.inverse(target.solution.trajectory[t]) @ poses @ source.solution.trajectory[s])
+            self._nats(other, view, np.stack([se3.inverse(poses[t]) @ poses[s] for poses in placed]))
             for t, view in targets.items()
             for s, other in sources.items()
         ]
         return np.stack(found, axis=1)
 
     def _within(self, *segments: Segment) -> Array:
-        """Return as `_nats` (2, m) the m pairs of views within segments; one of zeros if there are none."""
+        """Return as `_nats` (3, m) the m pairs of views within segments; one of zeros if there are none."""
         own = [
             self._nats(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[:, 0]
             for views, poses in ((self._spread(one, _MAX_VIEWS), one.solution.trajectory) for one in segments)
             for t, s in itertools.combinations(views, 2)
         ]
-        return np.stack(own, axis=1) if own else np.zeros((2, 1))
+        return np.stack(own, axis=1) if own else np.zeros((3, 1))
 
     def _independent(self, target: Segment, source: Segment) -> float:
         """Return the median number of independent measurements of a pair of views, one of each segment."""
@@ -334,6 +361,14 @@ def _aligned(target: Segment, source: Segment, posterior: Posterior) -> Array:
     """Return the alignment (4, 4) that the registration of a pair of views implies."""
     onto = target.solution.trajectory[posterior.target] @ posterior.pose.mean
     return onto @ se3.inverse(source.solution.trajectory[posterior.source])
+
+
+def _placed(target: Segment, source: Segment, alignment: Alignment) -> Mapping[int, Array]:
+    """Return the poses (4, 4) of the cameras of both segments in one frame, by frame number."""
+    if alignment.trajectory is not None:
+        return alignment.trajectory
+    moved = {frame: alignment.target_from_source @ pose for frame, pose in source.solution.trajectory.items()}
+    return {**target.solution.trajectory, **moved}
 
 
 def _mean_pose(target: Segment, source: Segment, edges: Sequence[Edge], guess: Array) -> Array:
