@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,12 +18,19 @@ from modeler.types import InputError
 
 def frame_numbers(stems: list[str]) -> dict[str, int] | None:
     """Parse frame numbers: whole names, leading digits, or the only digits that differ; None if ambiguous."""
-    for numbered in (stems, [re.split(r"[^0-9]", stem)[0] for stem in stems], _differences(stems)):
+    for numbered in _readings(stems):
         numbers = [frame_number(stem) for stem in numbered]
         known = [number for number in numbers if number is not None]
         if len(set(known)) == len(stems):
             return dict(zip(stems, known, strict=True))
     return None
+
+
+def _readings(stems: list[str]) -> Iterator[list[str]]:
+    """Yield what of names may be their numbers."""
+    yield stems
+    yield [re.split(r"[^0-9]", stem)[0] for stem in stems]
+    yield _differences(stems)
 
 
 def _differences(stems: list[str]) -> list[str]:
@@ -135,8 +142,8 @@ def partners(
             f"{next(iter(found.values())).parent}: its {len(found)} images cannot be matched with the {len(depth)} "
             "depth images; give those of one frame the same name."
         )
-    used = set(best.values())
-    return best, [path for path in found.values() if path not in used], tuple(remarks)
+    used = set(map(id, best.values()))  # which hashes faster than paths
+    return best, [path for path in found.values() if id(path) not in used], tuple(remarks)
 
 
 def _nearest_in_time(

@@ -52,7 +52,7 @@ from modeler.types import Array, Camera, Frame, InputError
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class FrameFiles:
     """Files of one frame."""
 

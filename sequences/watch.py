@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import final
+from typing import NamedTuple, final
 
 from modeler.sequences.base import FIRST, AbstractDerived, AbstractSequence, check_every
 from modeler.sequences.intrinsics import Overrides
@@ -24,7 +24,7 @@ END = "done"
 POLL_S = 0.05
 """Polling interval of the folder."""
 REST = 3.0
-"""So many times as long as looking took is rested at least: of 4000 frames it takes 40 ms."""
+"""So many times as long as looking took is rested at least: of 10,000 frames it takes 10 ms, with new ones 0.1 s."""
 
 
 @final
@@ -125,42 +125,47 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
         InputError: if nothing can be read.
     """
     taken: set[int] = set()
-    failing: dict[int, float] = {}  # since when a frame cannot be read
-    faults: dict[int | None, InputError] = {}
+    failing: dict[int, _Failing] = {}
     opened: AbstractSequence | None = None  # as the folder is now
-    state: object = None
+    fault = ""  # why it cannot be opened
+    looks = _Looks(path, patience.settle_s)
     came_s = changed_s = time.monotonic()
     while not stop():
-        now, before, state = time.monotonic(), state, _state(path)
-        rest_s = max(POLL_S, REST * (time.monotonic() - now))
-        changed_s = changed_s if state == before else now
-        faults = {}
-        if state != before or opened is None:
+        now, ended = time.monotonic(), (path / END).exists()  # what came before it, the look finds
+        if looks.changed(now):
+            changed_s, opened = now, None  # before the next one is there: either has some names for each frame
+        if opened is None:
             try:
-                opened = open_sequence(path, overrides)
+                opened, fault = open_sequence(path, overrides), ""
             except InputError as error:  # half-written, perhaps
-                faults[None], opened = error, None
-        ended = (path / END).exists()
+                fault = str(error)
+        rest_s = max(POLL_S, REST * (time.monotonic() - now))
+        idle = now - max(came_s, changed_s) >= patience.idle_s
         settled = ended or now - changed_s >= patience.settle_s
         coming = [] if opened is None else [(index, opened) for index in opened.indices if index not in taken]
         for index, sequence in coming if settled else coming[:-1]:
-            try:
-                frame = sequence.frame(index)
-            except InputError as error:
-                faults[index] = error
-                if not ended and now - failing.setdefault(index, now) < patience.settle_s:
-                    break  # it may be being written
+            before = failing.get(index, _Failing(now, now))
+            frame = None
+            if ended or idle or now >= before.again_s:
+                try:
+                    frame = sequence.frame(index)
+                except InputError as error:
+                    failing[index] = _Failing(before.since_s, 2.0 * now - before.since_s, str(error))
+            if frame is None and not ended and now - before.since_s < patience.settle_s:
+                break  # it may be being written
+            if frame is None:
                 continue
+            failing.pop(index, None)
             yield frame
             taken.add(index)
             came_s = time.monotonic()  # which the taker may have spent long with
             if stop():
                 return
-        if time.monotonic() - max(came_s, changed_s) >= patience.idle_s or (ended and settled):
-            for fault in faults.values():
+        if ended or (idle and time.monotonic() - max(came_s, changed_s) >= patience.idle_s):
+            for words in [fault] if fault else [failing[index].words for index, _ in coming if index in failing]:
                 if not taken:
-                    raise fault
-                _log.warning("%s: continuing with the frames so far", str(fault).rstrip("."))
+                    raise InputError(words)
+                _log.warning("%s: continuing with the frames so far", words.rstrip("."))
             return
         time.sleep(rest_s)
 
@@ -182,17 +187,65 @@ def watch(path: str | Path, overrides: Overrides | None = None, patience: WatchL
     return WatchedSequence(seen, path, overrides, patience)
 
 
-def _state(path: Path) -> object:
-    """Return what changes when a file in a folder or in one of its folders is made, grows or goes."""
-    found: list[tuple[str, int, int]] = []
-    waiting = [(str(path), 1)]
-    while waiting:
-        folder, deeper = waiting.pop()
-        with suppress(OSError):  # it went away between two looks
-            for entry in os.scandir(folder):
-                with suppress(OSError):  # this alone did, or it is a link to nothing
-                    status = entry.stat()
-                    found.append((entry.path, status.st_mtime_ns, status.st_size))
-                    if deeper and entry.is_dir():
-                        waiting.append((entry.path, deeper - 1))
-    return sorted(found)
+class _Failing(NamedTuple):
+    """A frame that cannot be read."""
+
+    since_s: float
+    """Of when."""
+    again_s: float
+    """When it is tried again: a damaged one costs less the longer it is."""
+    words: str = ""
+    """Why; not the error itself, which holds the images that were read before it."""
+
+
+@final
+class _Looks:
+    """Looks at a folder and at the folders in it, which cost no more than the names of files that are complete."""
+
+    def __init__(self, path: Path, settle_s: float) -> None:
+        """Begin with a folder that was never looked at.
+
+        Args:
+            path: the folder.
+            settle_s: a file in one of its folders is complete once it has not changed for so long.
+        """
+        self._path, self._settle_s = path, settle_s
+        self._complete: dict[str, set[str]] = {}  # names by folder
+        self._newer: dict[str, tuple[object, float]] = {}  # state, and since when it has it, by path
+
+    def changed(self, now_s: float) -> bool:
+        """Return whether a file was made, has grown or is gone since the look before."""
+        changed, before, waiting = False, self._newer, [(str(self._path), True)]
+        self._newer = {}
+        while waiting:
+            folder, is_top = waiting.pop()
+            found: list[os.DirEntry[str]] = []
+            with suppress(OSError):  # it went away between two looks
+                found = list(os.scandir(folder))
+            names, complete = {entry.name for entry in found}, self._complete.setdefault(folder, set())
+            if not complete <= names:
+                complete &= names
+                changed = True
+            for entry in found:
+                if entry.name in complete:
+                    continue
+                state, is_folder = _state(entry), entry.is_dir()
+                known, since_s = before.pop(entry.path, (None, now_s))
+                if state != known:
+                    since_s, changed = now_s, True
+                if is_folder or is_top or now_s - since_s < self._settle_s:
+                    self._newer[entry.path] = state, since_s
+                else:
+                    complete.add(entry.name)
+                if is_folder and is_top:
+                    waiting.append((entry.path, False))
+        return changed or bool(before)
+
+
+def _state(entry: os.DirEntry[str]) -> tuple[int, int]:
+    """Return what changes when a file, or what a folder holds, does."""
+    try:
+        status = entry.stat()
+    except OSError:  # it went away, or is a link to nothing
+        return 0, 0
+    return status.st_mtime_ns, status.st_size

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as commands do: matrices are small, and NumPy asks once
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=off")  # as modeler.viz does: Rerun asks as it is imported
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # without bytecode, each command that a test starts takes 2 s more
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from modeler.sequences import AbstractSequence, BopSequence, Overrides, WatchLimits, open_sequence, watch, write_bop
-from modeler.sequences.watch import _state, arriving
+from modeler.sequences.base import AbstractDerived
+from modeler.sequences.watch import POLL_S, _Looks, _state, arriving
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import small_frames, write_bundlesdf, write_tum
 
+WATCHING = sys.modules["modeler.sequences.watch"]  # of which the package has a function of the same name
 QUICK = WatchLimits(idle_s=1.0, settle_s=0.2, first=2)
 
 
@@ -89,7 +96,7 @@ def test_a_folder_is_opened_anew_only_once_it_has_changed(
         opened.append(path)
         return open_sequence(path, *more)
 
-    monkeypatch.setattr(sys.modules["modeler.sequences.watch"], "open_sequence", counted)
+    monkeypatch.setattr(WATCHING, "open_sequence", counted)
     write_bop(tmp_path / "s", frames, depth_scale_mm=1.0)
     arrived = arriving(tmp_path / "s", Overrides(), QUICK, lambda: False)
     assert [frame.index for frame in arrived] == [0, 1, 2, 3, 4]
@@ -216,9 +223,99 @@ def test_a_link_to_nothing_does_not_make_frames_count_as_settled(tmp_path: Path,
     write_bop(tmp_path / "s", frames)
     for folder in (tmp_path / "s", tmp_path / "s" / "rgb"):
         (folder / ".#lock").symlink_to("nobody@nowhere.1")
-    before = _state(tmp_path / "s")
-    (tmp_path / "s" / "rgb" / "000004.png").touch()
-    assert _state(tmp_path / "s") != before
-    before = _state(tmp_path / "s")
-    (tmp_path / "s" / "scene_camera.json").touch()
-    assert _state(tmp_path / "s") != before
+    looks = _Looks(tmp_path / "s", settle_s=1.0)
+    assert [looks.changed(0.0), looks.changed(0.1)] == [True, False]
+    for name in ("rgb/000004.png", "scene_camera.json"):
+        (tmp_path / "s" / name).touch()
+        assert [looks.changed(0.2), looks.changed(0.3)] == [True, False]
+
+
+def test_a_look_costs_time_for_what_is_new_alone(
+    tmp_path: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[str] = []
+
+    def counted(entry: os.DirEntry[str]) -> tuple[int, int]:
+        looked.append(entry.name)
+        return _state(entry)
+
+    monkeypatch.setattr(WATCHING, "_state", counted)
+    write_bop(tmp_path / "s", frames)
+    looks = _Looks(tmp_path / "s", settle_s=1.0)
+    always = sorted(entry.name for entry in (tmp_path / "s").iterdir())
+    assert looks.changed(0.0)
+    assert len(looked) == len(always) + 3 * len(frames)
+    assert not looks.changed(2.0)  # all are complete
+    new = tmp_path / "s" / "depth" / "000009.png"
+    for now_s, act, expected in (
+        (2.1, new.touch, [new.name]),
+        (2.2, lambda: new.write_bytes(b"more"), [new.name]),
+        (2.3, lambda: new.rename(new.with_name("000010.png")), ["000010.png"]),
+        (2.4, (tmp_path / "s" / "rgb" / "000000.png").unlink, ["000010.png"]),
+        (2.5, (tmp_path / "s" / "scene_camera.json").touch, ["000010.png"]),
+    ):
+        looked.clear()
+        act()
+        assert looks.changed(now_s)
+        assert sorted(looked) == sorted([*always, *expected])
+    assert not looks.changed(9.0)
+    shutil.rmtree(tmp_path / "s")
+    assert [looks.changed(10.0), looks.changed(11.0)] == [True, False]
+
+
+def test_a_damaged_frame_is_tried_less_and_less_often(
+    tmp_path: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But before the end, and it is taken if it was mended."""
+    now_s, tried = 0.0, []
+
+    def rest(seconds: float) -> None:
+        nonlocal now_s
+        now_s += seconds
+        if now_s > 300.0 and not (tmp_path / "s" / "done").exists():
+            damaged.write_bytes(content)
+            (tmp_path / "s" / "done").touch()
+
+    def noted(path: Path, *more: Any) -> AbstractSequence:
+        found = open_sequence(path, *more)
+        assert isinstance(found, BopSequence)
+        return Noted(found, tried)
+
+    write_bop(tmp_path / "s", frames, depth_scale_mm=1.0)
+    damaged = tmp_path / "s" / "depth" / "000001.png"
+    content = damaged.read_bytes()
+    damaged.write_bytes(content[:40])
+    monkeypatch.setattr(WATCHING, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=rest))
+    monkeypatch.setattr(WATCHING, "open_sequence", noted)
+    arrived = arriving(tmp_path / "s", Overrides(), WatchLimits(idle_s=1000.0), lambda: False)
+    assert [frame.index for frame in arrived] == [0, 2, 3, 4, 1]
+    assert tried.count(1) <= 4 + np.log2(300.0 / POLL_S)
+
+
+@dataclass(frozen=True)
+class Noted(AbstractDerived):
+    """Another sequence, with the numbers of the frames that were asked for."""
+
+    tried: list[int]
+
+    def frame(self, index: int) -> Frame:
+        self.tried.append(index)
+        return self.whole.frame(index)
+
+
+def test_frames_that_were_taken_or_cannot_be_read_leave_their_names_alone(tmp_path: Path) -> None:
+    """Some hundred bytes of memory each, where an image takes 80,000; one of ten is damaged."""
+    count, pixels = 400, np.random.default_rng(0).integers(500, 600, (100, 200), dtype=np.uint16)
+    (tmp_path / "depth").mkdir()
+    Image.fromarray(pixels).save(tmp_path / "depth" / "000000.png")
+    content = (tmp_path / "depth" / "000000.png").read_bytes()
+    for number in range(1, count):
+        whole = len(content) // (2 if number % 10 == 0 else 1)
+        (tmp_path / "depth" / f"{number:06d}.png").write_bytes(content[:whole])
+    (tmp_path / "camera.json").write_text('{"fx": 200, "fy": 200, "cx": 100, "cy": 50}')
+    held: list[int] = []
+    tracemalloc.start()
+    for _ in arriving(tmp_path, Overrides(), WatchLimits(settle_s=0.0), lambda: len(held) > 300):
+        held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert (held[300] - held[100]) / 200 < 400

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import tracemalloc
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from test_pipeline import FRAMES, modeler, trajectory_error
 
-from modeler.cli.console import Interrupt
+from modeler.cli.console import Console, Interrupt
 from modeler.export import RunFolder
 from modeler.export.report import RunMeta
 from modeler.pipeline import NewestFrames
@@ -158,3 +159,24 @@ def test_ctrl_c_ends_reading_and_a_second_one_filling_in(capsys) -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert "finishing" in capsys.readouterr().err
+
+
+def test_a_frame_without_the_object_leaves_some_hundred_bytes() -> None:
+    """Its number, time and reason, as a stand is watched all day; its images take 80,000."""
+    height, width = FRAMES[0].depth_m.shape
+    nothing = np.zeros((height, width), dtype=bool)
+
+    def seen() -> Iterator[Frame]:
+        yield from FRAMES[:3]
+        for number in range(1000, 1600):
+            depth_m = np.full((height, width), 0.9, dtype=np.float32)
+            yield replace(FRAMES[0], index=number, time_s=float(number), depth_m=depth_m, mask=nothing)
+
+    held = []
+    with Console(None, None) as console:
+        tracemalloc.start()
+        for event in modeler().start(Scene()).track(seen(), live=True):
+            console(event)
+            held.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    assert (held[-1] - held[100]) / (len(held) - 101) < 1000

@@ -119,8 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         handler.addFilter(worded_as_options)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of a home that it cannot write to
     logging.raiseExceptions = False  # stderr may be full
-    # Rerun logs a closed viewer, which is no error, and a full disk; we report what matters.
-    os.environ.setdefault("RUST_LOG", "warn,re_sdk=off,re_grpc_client=off,re_log_encoding=off")
     # Our matrices are small: waking BLAS threads takes longer than their work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):

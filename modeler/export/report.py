@@ -6,7 +6,7 @@ import math
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib import metadata
 from typing import Any
 
@@ -16,6 +16,7 @@ from modeler import se3
 from modeler.types import (
     Array,
     Edge,
+    FrameRecord,
     OptimisationOutlier,
     Plane,
     PoseGaussian,
@@ -37,6 +38,7 @@ _FREE_RAD = np.radians(
 )  # twice this is the usual step between views: the edge does not determine whether there was one
 _FREE_M = 0.01  # surfaces of a hand-sized object are then visibly apart
 _ALIKE = np.cos(np.radians(25.0))  # nearer than this, a direction goes by the name of another
+_OF_FRAME = tuple(entry.name for entry in fields(FrameRecord))
 _LONG = 1.5  # ratio of length to width above which an object has its own axis
 
 
@@ -131,7 +133,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         },
         "up": None if support is None else support.normal,
         "support_offset_m": None if support is None else support.offset_m,
-        "frames": [vars(frame) for frame in step.frames_so_far],
+        "frames": [{name: getattr(frame, name) for name in _OF_FRAME} for frame in step.frames_so_far],
     }
     poses = [
         {"id": frame, "object_from_camera": pose, "covariance": covariances[frame]}

@@ -42,8 +42,6 @@ class RunFolder:
     """The folder."""
     already: int = 0
     """Number of frames of a resumed run: its files are kept until that is reached again."""
-    newest: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
-    """The report that was written last."""
     pace: Pace = field(default_factory=Pace, init=False, repr=False)
     """When it may be written again."""
 
@@ -242,13 +240,13 @@ class RunFolder:
         )
 
     def write(self, step: Step, meta: RunMeta) -> dict[str, Any]:
-        """Bring the folder up to date and return the report that stands there then.
+        """Bring the folder up to date and return the report; nothing if the step is skipped.
 
         Raises:
             InputError: if a file cannot be written.
         """
         if not step.last and (len(step.frames_so_far) < self.already or self.pace.rests):
-            return self.newest
+            return {}
         began_s = time.monotonic()
         report = report_of(step, meta)
         times_s = {frame: view.frame.time_s for frame, view in step.views.items()}
@@ -264,9 +262,8 @@ class RunFolder:
             write_atomically(self.path / name, content, lasting=step.last)
         if not step.last:
             settle_soon(*(self.path / name for name in contents), self.path)
-        self.newest.update(report)
         self.pace.took(time.monotonic() - began_s)
-        return self.newest
+        return report
 
     def finish(self) -> None:
         """Bring the recording to the disk; take the mark of an unfinished run away unless it ended early.

@@ -98,7 +98,10 @@ def read_regular(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
     """
     try:
         with open_regular(path) as file:
-            content = file.read(most_bytes + 1) if os.fstat(file.fileno()).st_size <= most_bytes else None
+            size, content = os.fstat(file.fileno()).st_size, None
+            if size <= most_bytes:
+                content = file.read(size + 1)  # takes so much memory, however little there is to read
+                content += file.read(most_bytes - size) if len(content) > size else b""  # it grew, or states no size
     except OSError as error:
         raise unreadable(path, error) from None
     if content is None or len(content) > most_bytes:

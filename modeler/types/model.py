@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from sys import intern
 
 import numpy as np
 import numpy.typing as npt
@@ -97,7 +98,8 @@ class Step:
         """The result of the frame."""
         points = 0 if self.view is None else len(self.view.points_m)
         reason, mask = self.left_out, self.segmentation.outcome.label
-        outcome, cause = (ACCEPTED, "") if reason is None else (explain(reason), code(reason))
+        # The same words for thousands of frames in which nothing is.
+        outcome, cause = (ACCEPTED, "") if reason is None else (intern(explain(reason)), intern(code(reason)))
         return FrameRecord(self.frame.index, float(self.frame.time_s), points, outcome, cause, mask)
 
 

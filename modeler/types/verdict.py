@@ -9,7 +9,7 @@ from modeler.types.base import Array, Outcome
 from modeler.types.reasons import ACCEPTED
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class FrameRecord:
     """The result of one frame."""
 
