@@ -40,21 +40,24 @@ def diffused(normals, guide, areas, neighbours, edge, passes):
         edge: length of a difference in the guide across which nothing diffuses.
         passes: number of passes.
     """
+    weights = np.zeros(neighbours.shape)
+    for f in range(len(normals)):
+        for k in range(3):
+            g = neighbours[f, k]
+            if g < 0:
+                continue
+            share = (
+                (guide[f, 0] - guide[g, 0]) ** 2 + (guide[f, 1] - guide[g, 1]) ** 2 + (guide[f, 2] - guide[g, 2]) ** 2
+            ) / (edge * edge)
+            if share < 1.0:
+                weights[f, k] = areas[g] * (1.0 - share) ** 2
     normals, after = normals.copy(), np.empty_like(normals)
     for _ in range(passes):
         for f in range(len(normals)):
             x, y, z = areas[f] * normals[f, 0], areas[f] * normals[f, 1], areas[f] * normals[f, 2]
             for k in range(3):
-                g = neighbours[f, k]
-                if g < 0:
-                    continue
-                share = (
-                    (guide[f, 0] - guide[g, 0]) ** 2
-                    + (guide[f, 1] - guide[g, 1]) ** 2
-                    + (guide[f, 2] - guide[g, 2]) ** 2
-                ) / (edge * edge)
-                if share < 1.0:
-                    weight = areas[g] * (1.0 - share) ** 2
+                weight, g = weights[f, k], neighbours[f, k]
+                if weight > 0.0:
                     x, y, z = x + weight * normals[g, 0], y + weight * normals[g, 1], z + weight * normals[g, 2]
             length = math.sqrt(x * x + y * y + z * z)
             if length > 0.0:
