@@ -135,10 +135,11 @@ def _step(width: int) -> int:
 def _edges(frame: Frame, colour: npt.NDArray[np.uint8]) -> tuple[Array, Array]:
     """Return the edges of depth and of colour, shrunk; those of colour less their surroundings' mean."""
     bends = depth_edges(frame.depth_m)
-    slope = np.zeros(colour.shape[:2])
+    square = np.zeros(colour.shape[:2], dtype=np.float32)
     for channel in range(3):
-        smooth = ndimage.gaussian_filter(colour[..., channel].astype(np.float64), 1.0)
-        slope = np.maximum(slope, np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1)))
+        smooth = ndimage.gaussian_filter(colour[..., channel].astype(np.float32), 1.0)
+        square = np.maximum(square, ndimage.sobel(smooth, 0) ** 2 + ndimage.sobel(smooth, 1) ** 2)
+    slope = np.sqrt(square)
     steep = slope / (slope + np.percentile(slope, 80.0) + 1e-9)
     step = _step(frame.depth_m.shape[1])
     seen = _shrunk(steep, step)

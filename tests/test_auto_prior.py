@@ -102,9 +102,8 @@ def test_pairs_that_turn_the_other_way_than_the_rest_are_in_doubt() -> None:
     prior = TurntablePrior(24.0, 1.0, step_sign="unknown")
     doubtful = state.less_probable(prior, prior.learned(state.solution, graph.edges))
     assert doubtful == [edges[0]]
-    mended = state.reregistered(
-        lambda pairs: [replace(edges[0].posterior, pose=replace(edges[0].posterior.pose, mean=step))], doubtful
-    )
+    again = replace(edges[0].posterior, pose=replace(edges[0].posterior.pose, mean=step))
+    mended = state.reregistered(doubtful, [again])
     np.testing.assert_allclose(mended.solution.relative(0, 1), step, atol=1e-9)
     assert not mended.less_probable(prior, prior.learned(mended.solution, mended.graph.edges))
 

@@ -133,7 +133,8 @@ class PairCache(AbstractPairCache):
 
     def posterior_of(self, registrar: AbstractRegistrar, pair: ViewPair) -> Posterior:
         """Return the stored result of the same registration, or else register and store it."""
-        inputs = (registrar, sorted(self.versions.items()), pair.rng.bit_generator.state, pair.effort)
+        near = None if pair.near is None else pair.near.tobytes().hex()
+        inputs = (registrar, sorted(self.versions.items()), pair.rng.bit_generator.state, pair.effort, near)
         key = _of_views(inputs, (pair.source, pair.target)), _of_prior(pair.density)
         stored = self.pairs.get(pair.source.index, pair.target.index, key)
         if stored is not None:

@@ -62,6 +62,8 @@ class Attempt:
     """Of the motion between them."""
     effort: float = FULL
     """Share (0..1] of the usual effort. With less than `FULL`, a match is only a reason to try with that."""
+    near: Array | None = None
+    """(4, 4) the only mode that is asked for, if it is known roughly."""
     prefer: Prefer = field(default_factory=lambda: _newest)
     """Which of two registrations of the pair counts: an earlier one, or this one."""
 

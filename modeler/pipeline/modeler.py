@@ -306,7 +306,8 @@ class Run:
         """Register further pairs of views, whose edges make the poses more precise; none if an axis fits all steps."""
         tracker = self.modeler.tracker(self.state)
         if doubtful := self.state.less_probable(self.modeler.prior, tracker.learned_prior):
-            self.state = self.state.reregistered(tracker.between_views, doubtful)
+            pairs = [(edge.source, edge.target) for edge in doubtful]
+            self.state = self.state.reregistered(doubtful, tracker.between_views(pairs))
         for state, event in self._refinement(self.state):
             self.state = state
             yield event
@@ -453,7 +454,7 @@ class Run:
             nonlocal state, at
             if log_factor != at:
                 moved = state.under(log_factor - at, sensor)
-                state, at = moved.reregistered(self.modeler.tracker(moved).between_views), log_factor
+                state, at = moved.adjusted(self.modeler.tracker(moved).again), log_factor
             return MovingGraph.of(state.graph, state.solution).estimate(sigma, -at)
 
         focal = estimate_focal_length(estimate_at, reach=_FOCAL_REACH * sigma)

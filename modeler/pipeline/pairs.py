@@ -14,6 +14,7 @@ from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
     AbstractRegistrar,
+    Array,
     Edge,
     Failed,
     Frame,
@@ -94,7 +95,13 @@ class Registrations:
     """Results of an interrupted run, if any."""
 
     def register(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, *, effort: float = 1.0
+        self,
+        source: RayImage,
+        target: RayImage,
+        density: AbstractPoseDensity,
+        *,
+        effort: float = 1.0,
+        near: Array | None = None,
     ) -> Posterior:
         """Return the posterior of target_from_source.
 
@@ -103,9 +110,10 @@ class Registrations:
             target: another.
             density: prior density of target_from_source.
             effort: share (0..1] of the usual effort.
+            near: (4, 4) the only mode that is asked for, if it is known roughly.
         """
         rng = np.random.default_rng([self.seed, source.index, target.index])
-        pair = ViewPair(source, target, density, rng, effort)
+        pair = ViewPair(source, target, density, rng, effort, near)
         if self.cache is None:
             return self.registrar.posterior_of(pair)
         return self.cache.posterior_of(self.registrar, pair)

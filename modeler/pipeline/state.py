@@ -184,26 +184,30 @@ class State:
         smoother = replace(self.smoother, focal=None).to(graph)
         return replace(self, graph=graph, smoother=smoother, views=views, ready=ready, newest=newest, spans=spans)
 
-    def reregistered(
-        self, register: Callable[[Sequence[tuple[int, int]]], Iterable[Posterior]], edges: Sequence[Edge] | None = None
-    ) -> State:
-        """Return the state with accepted edges registered again.
-
-        Args:
-            register: returns the posteriors of pairs (source, target) of its views.
-            edges: those in doubt; None: all of one mode, which are replaced if the new pose is consistent.
-        """
-        some = edges or [edge for edge in self.graph.accepted if edge.kind != "join" and not edge.posterior.modes]
-        found = register([(edge.source, edge.target) for edge in some])
+    def reregistered(self, edges: Sequence[Edge], found: Iterable[Posterior]) -> State:
+        """Return the state with edges registered again: those with a usable posterior, given in the same order."""
         new = {
             edge: replace(edge, posterior=posterior.without_samples())
-            for edge, posterior in zip(some, found, strict=True)
+            for edge, posterior in zip(edges, found, strict=True)
             if posterior.usable
-            and (edges or (not posterior.modes and _same_place(edge.posterior.pose, posterior.pose)))
         }
         graph = replace(self.graph, edges=tuple(new.get(edge, edge) for edge in self.graph.edges))
         spans = tuple(new.get(edge, edge) for edge in self.spans)
         return replace(self, graph=graph, spans=spans, smoother=self.smoother.to(graph))
+
+    def adjusted(self, register: Callable[[Sequence[Edge]], Iterable[Posterior]]) -> State:
+        """Return the state with accepted edges of one mode registered again, where the new pose is consistent.
+
+        Args:
+            register: returns the posteriors of edges of its graph.
+        """
+        alone = [edge for edge in self.graph.accepted if edge.kind != "join" and not edge.posterior.modes]
+        found = [
+            (edge, posterior)
+            for edge, posterior in zip(alone, register(alone), strict=True)
+            if not posterior.modes and _same_place(edge.posterior.pose, posterior.pose)
+        ]
+        return self.reregistered([edge for edge, _ in found], [posterior for _, posterior in found])
 
     def less_probable(self, prior: AbstractPrior, learned: AbstractPrior) -> list[Edge]:
         """Return edges with previous views, a mode of which is less probable by what was learned from all: their sense.

@@ -105,6 +105,12 @@ class Tracker:
         searches = [self._search(self.state.views[source], target) for source, target in pairs]
         yield from parallel_map(self._registered, [one for search in searches for one in search.attempts("refine")])
 
+    def again(self, edges: Iterable[Edge]) -> Iterator[Posterior]:
+        """Yield posteriors of edges of the graph whose views have changed a little, in order: of their modes alone."""
+        known = [(edge.posterior.pose.mean, self._search(self.state.views[edge.source], edge.target)) for edge in edges]
+        attempts = [replace(one, near=near) for near, search in known for one in search.attempts("refine")]
+        yield from parallel_map(self._registered, attempts)
+
     def explained(self, edges: Iterable[Edge]) -> tuple[Edge, ...]:
         """Return edges, with the reason for those to which the prior does not apply."""
         return tuple(
@@ -138,4 +144,4 @@ class Tracker:
         except InputError as error:
             self.refusals[source.index, target.index] = PriorRefused(str(error))
             return failed(source, target, Outcome.NOT_APPLICABLE)
-        return self.registrations.register(source, target, density, effort=attempt.effort)
+        return self.registrations.register(source, target, density, effort=attempt.effort, near=attempt.near)

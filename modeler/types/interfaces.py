@@ -170,6 +170,8 @@ class ViewPair:
     """Source of all randomness."""
     effort: float = 1.0
     """Share (0..1] of the usual effort, for pairs that may share no surface."""
+    near: Array | None = None
+    """(4, 4) target_from_source of the only mode that is asked for, if it is known roughly."""
 
 
 class AbstractRegistrar(ABC):

@@ -30,7 +30,6 @@ from modeler.types import (
     Outcome,
     PoseGaussian,
     Posterior,
-    RayImage,
     ViewPair,
     are_separate,
     pooled,
@@ -87,21 +86,20 @@ class VisibilityRegistrar(AbstractRegistrar):
         as every mode that the search finds is sampled.
         """
         method = self if pair.effort == 1.0 else self.scaled(pair.effort)
-        return method._registered(pair.source, pair.target, pair.density, pair.rng)
+        return method._registered(pair)
 
     def scaled(self, effort: float) -> VisibilityRegistrar:
         """Return the method with a share (0..1] of the starts of a search and of the samples, of one mode."""
         sampler = replace(self.sampler, max_draws=int(effort * self.sampler.max_draws))
         return replace(self, search=self.search.scaled(effort), sampler=sampler, max_modes=1)
 
-    def _registered(
-        self, source: RayImage, target: RayImage, density: AbstractPoseDensity, rng: np.random.Generator
-    ) -> Posterior:
+    def _registered(self, views: ViewPair) -> Posterior:
         started = time.perf_counter()
+        source, target, density, rng = views.source, views.target, views.density, views.rng
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
         pair = self.likelihood.between(source, target, rng)
-        found = self.search.run(pair, density, rng, min_overlap=self.min_overlap)
+        found = self.search.run(pair, density, rng, min_overlap=self.min_overlap, near=views.near)
         # Overlaps are judged without noise near silhouettes, which the misfit of a wrong pose increases.
         noisy = pair.with_rim_m(pair.noises_m(found.poses[0], self.search.fine_m(pair))[1])
         modes_found = found.modes(pair.centre_m, self.search.extent(pair))[: self.max_modes]

@@ -123,7 +123,13 @@ class Search:
         return max(int(self.per_basin * basins), self.min_starts)
 
     def run(
-        self, pair: PairLikelihood, density: AbstractPoseDensity, rng: np.random.Generator, *, min_overlap: float
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        rng: np.random.Generator,
+        *,
+        min_overlap: float,
+        near: Array | None = None,
     ) -> Candidates:
         """Return candidates, best first, at least one.
 
@@ -133,10 +139,11 @@ class Search:
             rng: source of all randomness.
             min_overlap: overlap of the best pose inside the prior's support above which poses beyond it count only
                 within a basin of the support.
+            near: (4, 4) the only start, if the mode is known roughly.
         """
         parts = density.alternatives
         priors = [_moments(pair, part, rng) for part in parts]
-        descents = [self._descended(pair, part, prior, rng) for part, prior in zip(parts, priors, strict=True)]
+        descents = [self._descended(pair, part, prior, rng, near) for part, prior in zip(parts, priors, strict=True)]
         started, poses = (np.concatenate(kind) for kind in zip(*descents, strict=True))
         part = np.repeat(np.arange(len(parts)), [len(ended) for _, ended in descents])
         inside = np.isfinite(density.log_prior(poses))
@@ -164,13 +171,14 @@ class Search:
         return replace(found, beyond_gain=float(gains[best]), beyond=outside[best : best + 1])
 
     def _descended(
-        self, pair: PairLikelihood, density: AbstractPoseDensity, prior: PoseGaussian, rng: np.random.Generator
+        self,
+        pair: PairLikelihood,
+        density: AbstractPoseDensity,
+        prior: PoseGaussian,
+        rng: np.random.Generator,
+        near: Array | None,
     ) -> tuple[Array, Array]:
         """Return starting poses (n, 4, 4), and the poses (n, 4, 4) after descent from them."""
-        wanted = self.starts(pair, prior)
-        started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
-        if wanted > self.max_starts:
-            started = np.concatenate([started, self._from_features(pair, density)])
         regulariser = self._regulariser(pair, prior)
 
         def descended(poses: Array) -> Array:
@@ -178,6 +186,12 @@ class Search:
                 poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
             return poses
 
+        if near is not None:
+            return near[None], descended(near[None])
+        wanted = self.starts(pair, prior)
+        started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
+        if wanted > self.max_starts:
+            started = np.concatenate([started, self._from_features(pair, density)])
         poses = descended(started)
         turned = self._by_colour(pair, density, prior, poses, rng)
         if not len(turned):
