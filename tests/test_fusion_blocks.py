@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,6 +81,22 @@ def test_arrays_on_disk_are_what_was_written() -> None:
     for array, same in zip(made, kept, strict=True):
         disk.release()
         np.testing.assert_array_equal(array, same)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_place_on_the_disk_is_free_again_once_its_arrays_are_gone() -> None:
+    def files() -> int:
+        """Return how many files without a name are open."""
+        return sum(
+            os.readlink(entry).endswith("(deleted)") for entry in Path("/proc/self/fd").iterdir() if entry.exists()
+        )
+
+    disk, before = DiskArrays(chunk_bytes=2**16), files()
+    kept = [disk.written(np.full(1000, number)) for number in range(100)]
+    assert files() - before > 10
+    del kept[1:]
+    assert files() - before <= 3  # that of the first array, and the newest, which is open as well
+    np.testing.assert_array_equal(kept[0], 0)
 
 
 def test_clouds_are_averaged_together_as_they_are_at_once() -> None:

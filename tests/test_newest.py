@@ -60,7 +60,7 @@ def test_of_a_fast_source_the_newest_is_yielded_and_nothing_is_lost() -> None:
         kept.append(frame.index)
         return frame
 
-    newest, seen = NewestFrames(fast(), keep, max_gap_s=0.25), []
+    newest, seen = NewestFrames(fast(), lay_aside=keep, max_gap_s=0.25), []
     for frame in newest:
         seen.append(frame)
         assert read.wait(WAIT_S)

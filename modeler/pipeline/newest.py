@@ -26,7 +26,9 @@ class NewestFrames:
     """The source, in order of time but for frames that come late, which are skipped. If it raises, the error follows
     its frames."""
     keep: Callable[[Frame], Frame] = field(default_factory=lambda: ViewStore().keep_frame)
-    """Moves the images of a frame that has to wait out of memory; called by the reading thread."""
+    """Moves the images of a frame that came late out of memory; called by the reading thread."""
+    lay_aside: Callable[[Frame], Frame] = field(default_factory=lambda: ViewStore().keep_frame)
+    """The same for a frame whose turn has not come: its place on the disk is free again once it was processed."""
     max_gap_s: float = 0.25
     """Longest time between two frames with skipped ones in between: 15° of an object turned at 60° a second."""
     skipped: list[Frame] = field(default_factory=list)
@@ -53,7 +55,7 @@ class NewestFrames:
                     if frame.index < newest:  # it came late
                         self.skipped.append(self.keep(frame))
                         continue
-                    newest, kept = frame.index, self.keep(frame) if waiting else frame
+                    newest, kept = frame.index, self.lay_aside(frame) if waiting else frame
                     with state:
                         waiting.append(kept)
                         state.notify()

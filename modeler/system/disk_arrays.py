@@ -20,18 +20,19 @@ _ALIGNMENT = 64  # bytes, for every type of number
 
 @final
 class DiskArrays:
-    """Arrays in a file of `TMPDIR`, which has no name and ends with the process."""
+    """Arrays in files of `TMPDIR`, which have no names, and end with the last of their arrays, or with the process."""
 
     def __init__(self, chunk_bytes: int = 128 * 2**20) -> None:
         """Open nothing yet.
 
         Args:
-            chunk_bytes: of the file that are mapped together, a multiple of 64 kB.
+            chunk_bytes: of a file, if no array is larger.
         """
         self._chunk_bytes = chunk_bytes
         self._file: IO[bytes] | None = None
-        self._chunks: list[mmap.mmap] = []
-        self._end = self._filled = self._mapped = 0
+        self._chunk: mmap.mmap | None = None
+        self._chunks: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+        self._filled = 0
 
     def written(self, array: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
         """Return an array that is on disk.
@@ -41,16 +42,14 @@ class DiskArrays:
         """
         if not array.size:
             return array
-        if self._filled + array.nbytes > self._mapped:
-            self._map(
-                max(self._chunk_bytes, -(-array.nbytes // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY)
-            )
+        if self._chunk is None or self._filled + array.nbytes > len(self._chunk):
+            self._chunk = self._mapped(max(self._chunk_bytes, array.nbytes))
         assert self._file is not None
         offset, self._filled = self._filled, -(-(self._filled + array.nbytes) // _ALIGNMENT) * _ALIGNMENT
-        self._file.seek(self._end - self._mapped + offset)
+        self._file.seek(offset)
         self._file.write(np.ascontiguousarray(array).data.cast("B"))
         self._file.flush()
-        return np.frombuffer(self._chunks[-1], array.dtype, array.size, offset).reshape(array.shape)
+        return np.frombuffer(self._chunk, array.dtype, array.size, offset).reshape(array.shape)
 
     def release(self) -> None:
         """Drop from memory what was read of the arrays; where it is used again, it is read again."""
@@ -58,16 +57,19 @@ class DiskArrays:
             for chunk in self._chunks:
                 chunk.madvise(mmap.MADV_DONTNEED)
 
-    def _map(self, size: int) -> None:
-        """Map another part of the file; what was read of those before need not stay in memory."""
-        if self._file is None:
-            self._file = tempfile.TemporaryFile(prefix="modeler-")
-            weakref.finalize(self, self._file.close)
+    def _mapped(self, size: int) -> mmap.mmap:
+        """Return another file as memory; what was read of those before need not stay there."""
         self.release()
-        self._file.truncate(self._end + size)
+        file = tempfile.TemporaryFile(prefix="modeler-")
+        weakref.finalize(self, file.close)
+        file.truncate(size)
         # Writable, because compiled functions tell such arrays from others; nothing is written through it.
-        self._chunks.append(mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_WRITE, offset=self._end))
-        self._end, self._filled, self._mapped = self._end + size, 0, size
+        chunk = mmap.mmap(file.fileno(), size, access=mmap.ACCESS_WRITE)
+        if self._file is not None:
+            self._file.close()
+        self._chunks.add(chunk)
+        self._file, self._filled = file, 0
+        return chunk
 
 
 def release(array: npt.NDArray[np.generic]) -> None:
