@@ -36,6 +36,8 @@ from modeler.export.formats import cloud_ply, mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.export.placing import upright
 from modeler.export.reading import fault
+from modeler.fusion import Fuser
+from modeler.runs.reopening import reopened
 from modeler.types import (
     Array,
     InputError,
@@ -469,3 +471,11 @@ def test_a_support_that_is_seen_lies_level_in_a_view(last: Step) -> None:
     above = replace(view, plane=Plane(np.array([0.0, 0.0, -1.0]), 0.5, 0.01, 0.001))
     for without in (above, replace(view, plane=None)):
         assert np.array_equal(upright(without), np.eye(3))
+
+
+def test_a_model_that_is_fused_again_is_as_uncertain(built: Path) -> None:
+    run, before = reopened(built), read_model(built / "model.ply")
+    model = run.model(run.volume(Fuser()))
+    assert model.vertex_sigmas_m is not None
+    assert before.vertex_sigmas_m is not None
+    np.testing.assert_allclose(model.vertex_sigmas_m, before.vertex_sigmas_m, rtol=1e-3)

@@ -93,13 +93,11 @@ class Export:
         report = files.RunFolder(self.run_folder).result()  # a sequence may hold a model.ply as well: the true one
         if not report.get("poses"):
             raise InputError(f"{self.run_folder}: no frame of this run was accepted; report.json says why")
-        volume = _volume(self)
-        if volume is None:
+        volume, model = _fused(self)
+        if model is None:
             model = files.read_model(files.mesh_of(self.run_folder))
-        else:
-            model = volume.model(watertight=self.watertight)
-            if not len(model.triangles):
-                raise InputError(f"{self.run_folder}: its views give no surface; more of them are needed")
+        elif not len(model.triangles):
+            raise InputError(f"{self.run_folder}: its views give no surface; more of them are needed")
         if self.tint is not None:
             model = files.tinted(model, self.tint)
         count = self.triangles or (TRIANGLES if self.texture else None)
@@ -212,15 +210,16 @@ def _check_numbers(options: Export) -> None:
         raise InputError("--density-kg-m3 and --mass-kg both give the mass; give one of them")
 
 
-def _volume(options: Export) -> FusionVolume | None:
-    """Return the views of the run, if the mesh has to be fused again."""
+def _fused(options: Export) -> tuple[FusionVolume, ObjectModel] | tuple[None, None]:
+    """Return the views of the run and their model, if the mesh has to be fused again."""
     if not (options.watertight or options.texture or options.voxel_m is not None):
-        return None
+        return None, None
     from modeler.fusion import Fuser
     from modeler.runs.reopening import reopened
 
     run = reopened(options.run_folder, options.moved.sequence, say)
-    return run.volume(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
+    volume = run.volume(Fuser(voxel_m=options.voxel_m or run.report["settings"].get("voxel_m")))
+    return volume, run.model(volume, watertight=options.watertight)
 
 
 def _report(model: ObjectModel, options: Export) -> None:

@@ -145,7 +145,7 @@ class Preset:
 
     def _model(self, *, watertight: bool) -> ObjectModel:
         """Return the mesh in the object frame."""
-        model = self._volume.model(watertight=watertight)
+        model = self._reopened.model(self._volume, watertight=watertight)
         if not len(model.triangles):
             raise InputError(f"{self.run_folder}: its views give no surface; more of them are needed")
         return model

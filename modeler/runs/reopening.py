@@ -13,8 +13,8 @@ from typing import Any, TypeVar, final
 from modeler.composition import compose
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, edges_of, poses_of
-from modeler.fusion import Fuser, FusionVolume, conditional_covariances
-from modeler.graph import PoseGraph, solve
+from modeler.fusion import Fuser, FusionVolume, conditional_covariances, widened
+from modeler.graph import MovingGraph, PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.segmentation import Scene, scene_frames
 from modeler.sequences import (
@@ -26,7 +26,7 @@ from modeler.sequences import (
     read_focal_factor,
     read_noise,
 )
-from modeler.types import ACCEPTED, Array, Edge, InputError, RayImage, Solution
+from modeler.types import ACCEPTED, Array, Edge, InputError, ObjectModel, RayImage, Solution
 from modeler.views import Sensor
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
@@ -251,6 +251,15 @@ class Reopened:
     def volume(self, fuser: Fuser) -> FusionVolume:
         """Return the views fused as `modeler build` fuses them."""
         return fuser.volume(self.views, self.solution.trajectory, conditional_covariances(self.solution, self.edges))
+
+    def model(self, volume: FusionVolume, *, watertight: bool = False) -> ObjectModel:
+        """Return the model of its volume, whose vertices are as uncertain as those of `modeler build`."""
+        sigma = (self.report.get("camera") or {}).get("focal_factor_sigma")
+        if not sigma or not self.solution.covariances:
+            return widened(volume.model(watertight=watertight), self.solution)
+        graph = PoseGraph(edges=self.edges, first=min(self.solution.trajectory))
+        focal = replace(MovingGraph.of(graph, self.solution).estimate(sigma), sigma=sigma)  # loops have told it already
+        return widened(volume.model(watertight=watertight), replace(self.solution, focal=focal))
 
 
 def reopened(run: Path, moved: Sequence[Path] = (), announce: Callable[[str], None] = lambda words: None) -> Reopened:
