@@ -124,6 +124,14 @@ def test_a_prior_that_knows_the_motion_keeps_it_under_every_focal_length(rng: np
     np.testing.assert_allclose(0.02 * about_centre / SIGMAS, 0.0, atol=0.15)  # 1 without the prior
 
 
+def test_a_single_sample_depends_on_no_focal_length(rng: np.random.Generator) -> None:
+    found = AdaptiveSampler(samples=100).run(
+        Free(), lambda poses, log_focal: np.zeros(len(poses)), CENTRE_M, rng, nuisance=FocalNuisance(0.02, np.zeros(6))
+    )
+    alone = replace(found, weights=np.eye(len(found.weights))[3])
+    np.testing.assert_array_equal(alone.conditional(CENTRE_M).poses, alone.poses)
+
+
 def test_poses_are_scored_under_a_focal_length_as_views_that_were_made_with_it() -> None:
     sequence, step = open_sequence(bundled("box")), 0.01
     sensor = Sensor(sequence.sensor() or SensorNoise())

@@ -148,7 +148,9 @@ class WeightedSamples:
             return self
         mean, _ = se3.mean(self.poses, self.weights, about_m=centre_m)
         apart = self.weights * (self.log_focal - self.weights @ self.log_focal)
-        by_focal = apart @ se3.log(se3.inverse(mean) @ self.poses) / (apart @ self.log_focal)
+        if not (variance := float(apart @ self.log_focal)) > 0.0:  # a single sample has all weight
+            return self
+        by_focal = apart @ se3.log(se3.inverse(mean) @ self.poses) / variance
         rest = self.nuisance._replace(by_focal=by_focal)
         total = self.nuisance._replace(by_focal=self.nuisance.by_focal + by_focal)
         return replace(self, poses=rest.under(self.poses, -self.log_focal), nuisance=total)
