@@ -25,8 +25,8 @@ class NewestFrames:
     frames: Iterable[Frame]
     """The source, in order of time but for frames that come late, which are skipped. If it raises, the error follows
     its frames."""
-    keep: Callable[[Frame], Frame] = field(default_factory=lambda: ViewStore().keep_frame)
-    """Moves the images of a frame that came late out of memory; called by the reading thread."""
+    keep: Callable[[Frame], Frame] = field(default_factory=lambda: ViewStore(memory_bytes=0).keep_frame)
+    """Moves the images of a frame that came late out of memory until the end; called by the reading thread."""
     lay_aside: Callable[[Frame], Frame] = field(default_factory=lambda: ViewStore().keep_frame)
     """The same for a frame whose turn has not come: its place on the disk is free again once it was processed."""
     max_gap_s: float = 0.25
