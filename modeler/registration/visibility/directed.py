@@ -72,6 +72,11 @@ class DirectedLikelihood:
 
     def parameters(self, blur_m: float, typical_misfit: float = MISFIT) -> LikelihoodParameters:
         """Return the parameters of the kernel for surfaces with a blur, see the method, eq. 4.2 to 4.5."""
+        if (blur_m, typical_misfit) not in self._parameters:
+            self._parameters[blur_m, typical_misfit] = self._parameters_of(blur_m, typical_misfit)
+        return self._parameters[blur_m, typical_misfit]
+
+    def _parameters_of(self, blur_m: float, typical_misfit: float) -> LikelihoodParameters:
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
         missing = max(self.model.hidden_share, 1.0 - self.image.measured_share) if self.model.holes else 1.0
@@ -90,6 +95,11 @@ class DirectedLikelihood:
     @cached_property
     def _projections(self) -> dict[int, Projection]:
         """Cached projections by stride."""
+        return {}
+
+    @cached_property
+    def _parameters(self) -> dict[tuple[float, float], LikelihoodParameters]:
+        """Cached parameters: a mode is sampled with the same in every round."""
         return {}
 
     @cached_property

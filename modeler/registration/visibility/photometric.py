@@ -63,7 +63,7 @@ class PairColour:
     def band(self, blur_m: float) -> int:
         """Return the index of the band for surfaces with a blur."""
         blur_px = blur_m * self.target.frame.camera.fx / max(float(self.target.centroid_m[2]), 1e-3)
-        return int(np.clip(np.round(np.log2(max(blur_px / FINEST_PX, 1.0))), 0, BANDS - 1))
+        return min(round(math.log2(max(blur_px / FINEST_PX, 1.0))), BANDS - 1)
 
     def log_likelihoods(self, scored: Array, band: int, max_independent: float, *, stride: int) -> Array:
         """Return log L_c (n,) in nats: colours of matching surface against independent ones (method, eq. 7.3).

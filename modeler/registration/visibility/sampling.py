@@ -344,7 +344,7 @@ def _power(log_weights: Array, least: float) -> float:
     """Return the largest power of the weights that leaves an effective size of at least `least`."""
     possible = log_weights[np.isfinite(log_weights)]
     low, high = 0.0, 1.0
-    for _ in range(16):
+    for _ in range(8):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if effective_samples(middle * possible) > least else (low, middle)
     return max(low, 1e-4)
