@@ -20,6 +20,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "bench": ("speed against Open3D and the committed baseline", "minutes"),
     "bench.gpu": ("speed on an NVIDIA GPU against two CPU threads of the same machine", "minutes"),
     "bench.multiway": ("make a whole model by Open3D's recipes", "seconds"),
+    "bench.stages": ("processor seconds of a build by stage", "seconds"),
     "calibration": ("calibration of covariances on rendered pairs", "half an hour"),
     "calibration.by_camera": ("the same for cameras other than the renderer's", "20 minutes"),
     "colour": ("what colour tells: aligned, displaced, faint and natural", "half an hour a core"),

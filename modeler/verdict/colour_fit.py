@@ -37,6 +37,7 @@ _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a t
 _NORMAL_QUARTILE: Final = 0.6745  # median magnitude of a standard normal variable
 AT_LEAST: Final = 0.5  # of the correlation elsewhere, and of that one: less is found by chance on few points
 _INNER: Final[WeakKeyDictionary[RayImage, BoolArray]] = WeakKeyDictionary()  # as a view is part of several pairs
+_FEATURES: Final[WeakKeyDictionary[RayImage, tuple[float, np.ndarray]]] = WeakKeyDictionary()  # with the band's width
 
 
 @final
@@ -238,11 +239,14 @@ class Comparison:
 
     def feature(self, frame: int, width_px: float) -> np.ndarray:
         """Return the band-passed logarithms (h, w) of a view's colours, as (7.1) but over the whole image."""
-        colour = self.views[frame].frame.colour
-        assert colour is not None
-        logs = _LOGS[colour].sum(axis=-1)
-        near, wide = (ndimage.gaussian_filter(logs, ratio * width_px) for ratio in (1.0, 2.0))
-        return np.asarray(near - wide)
+        view = self.views[frame]
+        known = _FEATURES.get(view)
+        if known is None or known[0] != width_px:
+            assert view.frame.colour is not None
+            logs = _LOGS[view.frame.colour].sum(axis=-1)
+            near, wide = (ndimage.gaussian_filter(logs, ratio * width_px) for ratio in (1.0, 2.0))
+            _FEATURES[view] = known = width_px, np.asarray(near - wide)
+        return known[1]
 
     def features(self, width_px: float) -> np.ndarray:
         """Return those of all views that are compared (v, h, w)."""

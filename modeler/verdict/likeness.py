@@ -95,7 +95,6 @@ def likenesses(
     frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, MAX_VIEWS).astype(int))] if frames else []
     coloured = {frame: views[frame] for frame in frames if colour and has_colour(views[frame])}
     compared = Comparison(coloured, trajectory, ()) if coloured else None
-    features: dict[int, Array] = {}
     some = {frame: views[frame].along_curve[:: max(len(views[frame].points_m) // MAX_POINTS, 1)] for frame in frames}
     found = []
     for first, second in combinations(frames, 2):
@@ -115,7 +114,7 @@ def likenesses(
         one = Likeness(first, second, motion, normal, shaped, across=(first, second) in across)
         comparable = NEAR_DEG <= angle_deg and (angle_deg <= FAR_DEG or one.across)
         if compared is not None and first in coloured and second in coloured and comparable:
-            correlation, contrast = _print(compared, features, first, second)
+            correlation, contrast = _print(compared, first, second)
             one = replace(one, correlation=correlation, contrast=contrast)
         found.append(one)
     return found
@@ -163,12 +162,11 @@ def _shares(matching: Array, normals: Array) -> tuple[float, float]:
     return float(1.0 - np.mean(near)), float(np.sum(near) / max(np.sum(face), 1))
 
 
-def _print(compared: Comparison, features: dict[int, Array], first: int, second: int) -> tuple[float, float]:
+def _print(compared: Comparison, first: int, second: int) -> tuple[float, float]:
     """Return the correlation of print on surface of two views, and its variance in the view with less; or NaN.
 
     Args:
         compared: the views with colour.
-        features: of views, which those of the two are added to.
         first: frame number of one.
         second: of the other.
     """
@@ -177,10 +175,9 @@ def _print(compared: Comparison, features: dict[int, Array], first: int, second:
         return np.nan, np.nan
     values = []
     for frame in (first, second):
-        if frame not in features:
-            features[frame] = compared.feature(frame, compared.width_px)
+        feature = compared.feature(frame, compared.width_px)
         here = places_in(compared.views[frame], se3.transform(se3.inverse(compared.trajectory[frame]), pair.points_m))
-        values.append(ndimage.map_coordinates(features[frame], here[:, ::-1].T, order=1, mode="nearest"))
+        values.append(ndimage.map_coordinates(feature, here[:, ::-1].T, order=1, mode="nearest"))
     contrast = float(min(np.var(value) for value in values))
     return (float(np.corrcoef(values)[0, 1]), contrast) if contrast > 0.0 else (np.nan, np.nan)
 
