@@ -14,7 +14,7 @@ from modeler import se3
 from modeler.export.bop import symmetry_entries
 from modeler.fusion import Symmetries, SymmetryFinder
 from modeler.fusion.paint import cielab
-from modeler.types import Array
+from modeler.types import Array, ObjectModel
 
 SIGMA_M = 3e-4
 
@@ -71,6 +71,20 @@ SHAPES = {
 @cache
 def of_shape(name: str) -> Symmetries:
     return found(SHAPES[name][0])
+
+
+def test_turns_that_leave_a_model_as_it_is_are_those_about_its_axis() -> None:
+    for name, count in (("cylinder", 1), ("bracket", 0)):
+        vertices, triangles, up = noisy(SHAPES[name][0])
+        normals = np.zeros_like(vertices)
+        model = ObjectModel(vertices, normals, None, vertices, triangles, normals, None)
+        turns = SymmetryFinder().free_turns(model)
+        assert turns.shape == (count, 6)
+        for turn in turns:
+            assert abs(turn[:3] @ up) > np.cos(np.radians(0.5))
+            assert (
+                np.quantile(distances(vertices, triangles, se3.transform(se3.exp(0.7 * turn), vertices)), 0.9) < 0.001
+            )
 
 
 @pytest.mark.parametrize("name", quick_first(SHAPES, 3))

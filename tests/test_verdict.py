@@ -1,11 +1,12 @@
 """The verdict on a model: every check speaks against wrong models, and not against right ones."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from run_builders import ball
 from scipy.special import ndtr
 
 from modeler import se3
@@ -26,6 +27,8 @@ from modeler.types import (
     HandPoses,
     LowOverlap,
     Mode,
+    ObjectModel,
+    OpenRotation,
     Outcome,
     Plane,
     PoseGaussian,
@@ -63,6 +66,7 @@ MIDDLE = se3.translation(np.array([0.0, 0.0, 0.6]))
 UP = (0.0, -1.0, 0.0)
 ABOUT_OBJECT = np.diag(np.repeat([np.radians(0.3), 0.0005], 3) ** 2)
 COVARIANCE = se3.adjoint(MIDDLE) @ ABOUT_OBJECT @ se3.adjoint(MIDDLE).T
+SPIN = np.array([0.0, 1.0, 0.0, -0.6, 0.0, 0.0])  # ξ of a turn about the vertical through the object, by 1 rad
 
 
 def turned(angle_deg: float) -> Array:
@@ -410,10 +414,16 @@ def whole_run(
     expected: bool = False,
     depth_scale_sigma: float = 0.0,
     focal: FocalLength | None = None,
+    spin_rad: float = 0.0,
+    free_turns: Callable[[ObjectModel], Array] | None = None,
 ) -> tuple[list[str], dict[str, bool]]:
     """Codes of what is wrong with a run whose poses are true, and which figures hold."""
     views, poses = views_of(angles_deg), poses_of(angles_deg)
-    edges = tuple(joined(k, k - 1, poses) for k in range(1, len(views)))
+    spun = COVARIANCE + spin_rad**2 * np.outer(SPIN, SPIN)
+    edges = tuple(
+        joined(k, k - 1, poses, pose=PoseGaussian(se3.inverse(poses[k - 1]) @ poses[k], spun))
+        for k in range(1, len(views))
+    )
     if refused is not None:
         edges = (*edges, replace(joined(len(views) - 1, 0, poses, kind="closure"), accepted=False, reason=refused))
     masks = [Outcome.UNSURE_MASK if index < unsure else Outcome.CONVERGED for index in views]
@@ -432,9 +442,15 @@ def whole_run(
         views=views,
         frames_so_far=tuple(frames),
         last=last,
+        make_model=ball,
     )
     verdict = judged(
-        step, prior=prior, closure_expected=expected, depth_scale_sigma=depth_scale_sigma, tolerance_m=0.005
+        step,
+        prior=prior,
+        closure_expected=expected,
+        depth_scale_sigma=depth_scale_sigma,
+        tolerance_m=0.005,
+        free_turns=free_turns,
     )
     assert verdict.trustworthy == (not verdict.reasons)
     return list(verdict.codes), {name: check.holds for name, check in verdict.checks.items()}
@@ -448,6 +464,25 @@ def test_poses_that_hang_on_the_focal_length_are_not_to_be_trusted(sigma: float,
     focal = FocalLength(0.0, sigma, sigma, 0, 0.0, 0.0, by_focal)
     found, _ = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0), focal=focal)
     assert found == codes
+
+
+@pytest.mark.parametrize(
+    ("turns", "codes"),
+    [
+        (np.array([SPIN]), []),
+        (np.zeros((0, 6)), ["closures_refused", "unsure_rotation", "unsure_place"]),
+        (np.array([[1.0, 0.0, 0.0, 0.0, 0.6, 0.0]]), ["unsure_rotation", "unsure_place"]),  # about another axis
+    ],
+)
+def test_how_far_a_body_of_revolution_turned_is_no_matter_of_its_model(turns: Array, codes: list[str]) -> None:
+    found, _ = whole_run(
+        STEPS_DEG, spin_rad=0.1, refused=OpenRotation(9.0), expected=True, free_turns=lambda model: turns
+    )
+    assert found == codes
+    elsewhere, _ = whole_run(
+        STEPS_DEG, spin_rad=0.1, refused=LowOverlap(0.3, 0.4), expected=True, free_turns=lambda model: turns
+    )
+    assert elsewhere == ["closures_refused", "unsure_rotation", "unsure_place"]
 
 
 def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:

@@ -150,6 +150,19 @@ class SymmetryFinder:
             colours=model.vertex_colours,
         )
 
+    def free_turns(self, model: ObjectModel) -> Array:
+        """Return ξ (k, 6) of turns by 1 rad under which shape and colours of a model stay, in the object frame.
+
+        About the axis of a body of revolution, or about three axes through the centre of a ball.
+
+        Args:
+            model: with a mesh.
+        """
+        found = self.find_in(model, np.array([0.0, -1.0, 0.0]))
+        axes = (found.with_colour or found).continuous
+        turns = [np.concatenate([axis.direction, np.cross(axis.point_m, axis.direction)]) for axis in axes]
+        return np.array(turns).reshape(-1, 6)
+
     def _of_shape(self, search: _Search, up: Array) -> Symmetries:
         """Return the symmetries of the shape."""
         likely = search.likely_axes(up)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -15,12 +15,15 @@ from modeler.types import (
     AWAY_DEG,
     NEAR_DEG,
     AbstractPrior,
+    Array,
     Check,
     Edge,
     Failed,
     FocalLength,
     FrameRecord,
     LowOverlap,
+    ObjectModel,
+    OpenRotation,
     OptimisationOutlier,
     Outcome,
     Shortcoming,
@@ -69,6 +72,7 @@ def judged(
     depth_scale_sigma: float = 0.0,
     tolerance_m: float | None = None,
     colour: bool = True,
+    free_turns: Callable[[ObjectModel], Array] | None = None,
 ) -> Verdict:
     """Judge the model of a run. Evidence is gathered after the last step, when all edges are in.
 
@@ -80,6 +84,9 @@ def judged(
         depth_scale_sigma: standard deviation of the depth scale's logarithm, as the camera was given; 0 = exact.
         tolerance_m: error of the surface above which a model is wrong; None: `default_tolerance_m`.
         colour: whether colour is to fit depth.
+        free_turns: returns ξ (k, 6) of turns by 1 rad in the object frame under which a model stays as it is: about
+            the axis of a body of revolution, or three axes of a ball. How far it turned so is no matter of its surface.
+            None: it is not asked.
     """
     reasons, frames = [], step.frames_so_far
     if tolerance_m is None:
@@ -98,12 +105,16 @@ def judged(
     found += _colour(step) if step.last and colour else []
     found += _alike(step, edges, prior, tolerance_m, colour=colour) if step.last else []
     reasons += _against(found)
-    reasons += _open_loop(step, edges, closure_expected=closure_expected)
-    reasons += _unconfirmed_join(edges)
-    spreads = []
+    spreads, open_loop = [], _open_loop(step, edges, closure_expected=closure_expected)
     if step.last:
-        spreads = [*_spreads(step, edges, tolerance_m), *_size(step, depth_scale_sigma, tolerance_m)]
-    reasons += _against(spreads)
+        about_mean = AboutMean.of(step.solution)
+        spreads = _spreads(step, edges, tolerance_m, about_mean)
+        model = step.model if free_turns is not None and _only_turns_are_open(spreads, open_loop, step) else None
+        if free_turns is not None and model is not None and len(turns := free_turns(model)):
+            spreads = _spreads(step, edges, tolerance_m, about_mean.but_for(turns, step.solution.trajectory))
+            open_loop = []
+        spreads += _size(step, depth_scale_sigma, tolerance_m)
+    reasons += [*open_loop, *_unconfirmed_join(edges), *_against(spreads)]
     checks = {finding.name: finding.check for finding in (*found, *spreads)}
     return Verdict(tuple(reasons), checks, tolerance_m, {} if free is None else free.contradictions)
 
@@ -236,10 +247,17 @@ def _alike(
     return found
 
 
-def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float) -> list[_Finding]:
+def _only_turns_are_open(spreads: Sequence[_Finding], open_loop: Sequence[Shortcoming], step: Step) -> bool:
+    """Return whether a rotation is too uncertain, and whatever closures were refused leave one open."""
+    unsure = any(finding.code == "unsure_rotation" and not finding.check.holds for finding in spreads)
+    refused = [edge.reason for edge in step.edges_so_far if edge.kind == "closure" and not edge.accepted]
+    by_turns = all(isinstance(reason, OpenRotation) for reason in refused)
+    return unsure and all(one.code == "closures_refused" and by_turns for one in open_loop)
+
+
+def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float, about_mean: AboutMean) -> list[_Finding]:
     """Return the uncertainty of the poses of a whole run."""
     found, factor, focal = [], misfit(edges, step.solution), step.solution.focal
-    about_mean = AboutMean.of(step.solution)
     if (turn := spread_of_rotations(about_mean, factor)) is not None:
         words = f"the rotation of frame {turn.frame} is uncertain by {turn.check.value:.1f}° (one standard deviation)"
         words += f", {turn.count - 1} more by over {turn.check.limit:.1f}°" if turn.count > 1 else ""

@@ -78,6 +78,21 @@ class AboutMean:
         from_object = {frame: se3.adjoint(se3.inverse(solution.trajectory[frame])) for frame in frames}
         return cls({k: from_object[k] @ (to_mean[k] - among) @ from_object[k].T for k in frames}, weights)
 
+    def but_for(self, turns: Array, trajectory: Mapping[int, Array]) -> AboutMean:
+        """Return the uncertainty without that of turns under which the surface stays as it is.
+
+        Args:
+            turns: (k, 6) ξ of turns by 1 rad about an axis, or about three at right angles, in the object frame.
+            trajectory: object_from_camera (4, 4) by frame number.
+        """
+        covariances = {}
+        for frame, covariance in self.covariances.items():
+            rest = np.eye(6)
+            for here in turns @ se3.adjoint(se3.inverse(trajectory[frame])).T:
+                rest -= np.outer(here, np.concatenate([here[:3], np.zeros(3)]))  # ξ less its angle about the axis
+            covariances[frame] = rest @ covariance @ rest.T
+        return replace(self, covariances=covariances)
+
 
 def spread_of_rotations(about_mean: AboutMean, factor: float = 1.0) -> Spread | None:
     """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
