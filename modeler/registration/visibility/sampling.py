@@ -215,9 +215,9 @@ class AdaptiveSampler:
 
     draws: int = 200
     """Samples per round; regions that the first round misses may also be missed by later ones."""
-    samples: int = 150
-    """Effective sample size at which the rounds end, and largest number of samples in the result: means scatter by 0.08
-    sd, a quarter of what the choice of points moves them by."""
+    samples: int = 300
+    """Effective sample size at which the rounds end, and largest number of samples in the result: means scatter by 0.06
+    sd, a fifth of what the choice of points moves them by."""
     max_draws: int = 8000
     """Number of samples after which no further round begins."""
     min_effective: float = 100.0
