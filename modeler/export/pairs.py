@@ -56,9 +56,11 @@ class Pairs:
             target: frame number.
             key: digests of views and method, and of the prior.
         """
-        before = self._done.glob(self._name(source, target, (key[0], "*")))
-        places = [self._path(source, target, key), self._done / self._name(source, target, key), *sorted(before)]
-        return next((found for path in places if (found := _read(path)) is not None), None)
+        for path in (self._path(source, target, key), self._done / self._name(source, target, key)):
+            if (found := _read(path)) is not None:
+                return found
+        before = sorted(self._done.glob(self._name(source, target, (key[0], "*"))))  # lists all pairs: only if need be
+        return next((found for path in before if (found := _read(path)) is not None), None)
 
     def keep(self, posterior: Posterior, key: tuple[str, str]) -> None:
         """Store the result. If this fails, as on a full disk, it will be computed again."""

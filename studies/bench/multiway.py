@@ -6,7 +6,7 @@ are those of the sequence.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -47,10 +47,14 @@ def trajectory(frames: list[Frame]) -> list[Array]:
 
 def main() -> None:
     """Make the mesh."""
-    sequence = open_sequence(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(prog="python -m studies bench.multiway", description=__doc__)
+    parser.add_argument("sequence", type=Path, help="with masks")
+    parser.add_argument("mesh", type=Path, help="PLY file to write")
+    options = parser.parse_args()
+    sequence = open_sequence(options.sequence)
     frames = [sequence.frame(index) for index in sequence.indices]
     mesh = tsdf(frames, trajectory(frames), PYRAMID_M[-1], 4.0 * PYRAMID_M[-1])
-    o3d.t.io.write_triangle_mesh(Path(sys.argv[2]), mesh)
+    o3d.t.io.write_triangle_mesh(options.mesh, mesh)
 
 
 if __name__ == "__main__":
