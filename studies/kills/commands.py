@@ -41,7 +41,16 @@ _RECIPE: Final = (
     '{"object": {"kind": "box", "size_m": [0.1, 0.08, 0.06]}, "view": {"width": 80, "height": 60, "focal_px": 72},'
     ' "trajectory": {"kind": "tabletop", "frames": 3}}'
 )
-_TIMED: Final = (".json", ".html", ".rrd", ".csv", ".md", ".parquet", ".log")  # files that say how long something took
+_TIMED: Final = (
+    ".json",
+    ".html",
+    ".rrd",
+    ".csv",
+    ".md",
+    ".parquet",
+    ".log",
+    ".pair",
+)  # files that say how long something took
 _LIMIT_S: Final = 400
 
 
