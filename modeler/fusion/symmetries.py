@@ -32,6 +32,11 @@ class Axis:
     point_m: Array
     """(3,) a point on it."""
 
+    @property
+    def turn(self) -> Array:
+        """ξ (6,) of a turn about it by 1 rad, in the object frame."""
+        return np.concatenate([self.direction, np.cross(self.point_m, self.direction)])
+
 
 @dataclass(frozen=True, eq=False)
 class Symmetries:
@@ -159,9 +164,7 @@ class SymmetryFinder:
             model: with a mesh.
         """
         found = self.find_in(model, np.array([0.0, -1.0, 0.0]))
-        axes = (found.with_colour or found).continuous
-        turns = [np.concatenate([axis.direction, np.cross(axis.point_m, axis.direction)]) for axis in axes]
-        return np.array(turns).reshape(-1, 6)
+        return np.array([axis.turn for axis in (found.with_colour or found).continuous]).reshape(-1, 6)
 
     def _of_shape(self, search: _Search, up: Array) -> Symmetries:
         """Return the symmetries of the shape."""

@@ -74,6 +74,5 @@ def free_directions(symmetries: Symmetries, *, coloured: bool) -> Array:
     found = symmetries.with_colour if coloured and symmetries.with_colour is not None else symmetries
     covariance = np.zeros((6, 6))
     for axis in found.continuous:
-        turn = np.concatenate([axis.direction, np.cross(axis.point_m, axis.direction)])
-        covariance += np.pi**2 / 3.0 * np.outer(turn, turn)
+        covariance += np.pi**2 / 3.0 * np.outer(axis.turn, axis.turn)
     return covariance
