@@ -209,11 +209,7 @@ def _advice(prior: AbstractPrior, report: Mapping[str, Any]) -> list[str]:
 
 
 def _opened(sequence: str | Path | Iterable[Frame], *, live: bool) -> AbstractSequence:
-    """Return what frames are read from.
-
-    Raises:
-        InputError: if nothing can be.
-    """
+    """Return what frames are read from."""
     if isinstance(sequence, str | Path):
         return KeptSequence(open_sequence(Path(sequence)))
     return sequence if isinstance(sequence, AbstractSequence) else GivenSequence.of(sequence, live=live)

@@ -103,11 +103,9 @@ class AbstractSequence(ABC):
         return self
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.indices)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Read the frames in order."""
         return (self.frame(index) for index in self.indices)
 
     def select(self, every: int = 1, frames: slice | None = None) -> AbstractSequence:
@@ -291,11 +289,7 @@ class GivenSequence(AbstractSequence):
 
 
 def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yield frames of ascending numbers.
-
-    Raises:
-        InputError: if one is no frame, or its number is not greater than the one before.
-    """
+    """Yield frames of ascending numbers."""
     last = None
     for frame in frames:
         if not isinstance(frame, Frame):

@@ -130,7 +130,6 @@ class CalibratedSequence(AbstractDerived):
         return replace(self, whole=self.whole.select(every, frames))
 
     def __iter__(self) -> Iterator[Frame]:
-        """Read the frames in order."""
         return iter(self.whole)
 
     @cached_property
@@ -217,7 +216,6 @@ class RefocusedSequence(AbstractDerived):
         return self._refocused(self.whole.frame(index))
 
     def __iter__(self) -> Iterator[Frame]:
-        """Read the frames in order."""
         return map(self._refocused, self.whole)
 
     def select(self, every: int = 1, frames: slice | None = None) -> RefocusedSequence:

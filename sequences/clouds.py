@@ -43,9 +43,7 @@ class CloudSequence(AbstractRecording):
     unit_mm: float
     """Millimetres per unit of the coordinates."""
     unit_source: str
-    """Source of the unit."""
     camera: Camera
-    """The camera."""
     axes: Axes = "camera"
     """Of the coordinates."""
     is_organised: bool = True
@@ -170,9 +168,6 @@ def _intrinsics(
         first: the first of them, in camera coordinates.
         axes: of the files.
         overrides: values that take precedence.
-
-    Raises:
-        InputError: if they are not known.
     """
     intrinsics, columns, rows = overrides.intrinsics, *first.size
     first_path = next(iter(clouds.values()))
@@ -230,11 +225,7 @@ def _slopes(points: npt.NDArray[np.float64]) -> Array:
 
 
 def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
-    """Return the intrinsics of a grid of pixels whose rays points (n, 2) lie on, the principal point but for pixels.
-
-    Raises:
-        InputError: if they lie on none.
-    """
+    """Return the intrinsics of a grid of pixels whose rays points (n, 2) lie on, the principal point but for pixels."""
     (fx, cx), (fy, cy) = _steps(slopes[:, 0]), _steps(slopes[:, 1])
     if not sane((fx, fy, cx, cy)) or max(fx, fy) > _MAX_ASPECT * min(fx, fy):
         raise InputError(
@@ -291,9 +282,6 @@ def _window(
         intrinsics: of the camera.
         axes: of the files.
         whole: whether the principal point is given, so that pixels count from the image's corner.
-
-    Raises:
-        InputError: if a cloud cannot be read, or the image would be too large.
     """
     fx, fy, cx, cy = intrinsics
     lows, highs = [], []
@@ -373,11 +361,7 @@ def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
 
 
 def _fitted(points: npt.NDArray[np.float64], pixels: npt.NDArray[np.float64], path: Path) -> Intrinsics:
-    """Return the intrinsics of the camera that saw points (n, 3) at pixels (n, 2).
-
-    Raises:
-        InputError: if no pinhole camera that looks along z saw them.
-    """
+    """Return the intrinsics of the camera that saw points (n, 3) at pixels (n, 2)."""
     seen = np.isfinite(points).all(axis=1) & (points[:, 2] > _LEAST_Z) & np.isfinite(pixels).all(axis=1)
     if np.count_nonzero(seen) < 100:
         raise InputError(

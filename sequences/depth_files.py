@@ -53,11 +53,7 @@ def read_depth(path: Path | EmbeddedImage) -> RawDepth:
 
 
 def _as_depth(pixels: npt.NDArray[np.generic], path: Path | EmbeddedImage) -> RawDepth:
-    """Return an array (h, w) or (h, w, 1) as depth.
-
-    Raises:
-        InputError: if its values cannot be depth.
-    """
+    """Return an array (h, w) or (h, w, 1) as depth."""
     pixels = pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
     if pixels.ndim != 2 or not pixels.size or pixels.dtype.kind not in "iuf" or pixels.dtype == np.uint8:
         raise InputError(f"{path}: holds {pixels.dtype} values of shape {pixels.shape}; {_WANTED}.")

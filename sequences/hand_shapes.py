@@ -32,7 +32,6 @@ class HandShape:
     """Widening of the capsules, for errors of the poses and of the shape."""
 
     def __post_init__(self) -> None:
-        """Check the shapes."""
         assert self.ends_m.shape == (len(self.radii_m), 2, 3)
 
     def marked(self, frame: Frame, camera_from_hand: Array) -> BoolArray:
@@ -83,9 +82,7 @@ class HandMarkedSequence(AbstractDerived):
     """Another sequence whose frames have a robot's hand masked, in addition to their own masks."""
 
     shape: HandShape
-    """Of the hand."""
     poses: HandPoses
-    """Of the hand."""
 
     def frame(self, index: int) -> Frame:
         """Return a frame with the hand marked.

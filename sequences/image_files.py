@@ -35,7 +35,6 @@ class EmbeddedImage:
     """An image that is stored within another file."""
 
     content: bytes
-    """Its bytes."""
     where: str
     """The file and the place in it, for error messages."""
 
@@ -71,11 +70,7 @@ def open_image(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Im
 
 @contextlib.contextmanager
 def _stream(path: Path | EmbeddedImage) -> Iterator[IO[bytes]]:
-    """Open an image for reading.
-
-    Raises:
-        InputError: if it is no regular file, missing or cannot be opened.
-    """
+    """Open an image for reading."""
     if isinstance(path, EmbeddedImage):
         yield io.BytesIO(path.content)
         return

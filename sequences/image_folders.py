@@ -80,13 +80,11 @@ class ImageFolderSequence(AbstractRecording):
     files: Mapping[int, FrameFiles]
     """By frame number, ascending."""
     camera: CameraFacts
-    """The camera."""
     depth_scale_mm: float
     """Millimetres per unit of depth."""
     what: str
     """Storage format, for people."""
     unit_source: str
-    """Source of the unit."""
     read_truth: Callable[[], dict[int, Array] | None] = lambda: None
     """Reads the true camera_from_model (4, 4) in m by frame number, when it is asked for."""
     remarks: tuple[str, ...] = ()
@@ -208,7 +206,6 @@ class FoundImages:
     depth: Mapping[str, Path]
     """At least one."""
     colour: Mapping[str, Path] = field(default_factory=dict)
-    """Colour images."""
     masks: Mapping[str, Path] = field(default_factory=dict)
     """Masks of the object."""
     occluders: Mapping[str, Path] = field(default_factory=dict)

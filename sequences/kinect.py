@@ -196,11 +196,7 @@ _HOLE_BYTES = 1 << 30  # which the library reads in a second
 
 
 def _check_whole(path: Path) -> None:
-    """Reject a file whose end was never written, as after a disk was full: the library would look for images in it.
-
-    Raises:
-        InputError: if it is such.
-    """
+    """Reject a file whose end was never written, as after a disk was full: the library would look for images in it."""
     with open(path, "rb") as file:
         size = file.seek(0, os.SEEK_END)
         hole_bytes = size - os.lseek(file.fileno(), 0, getattr(os, "SEEK_HOLE", os.SEEK_END)) if size else 0

@@ -245,9 +245,6 @@ def _started(rs: Any, serial: str, context: Any) -> RunningCamera:
         rs: the library.
         serial: may be empty.
         context: where to look for cameras; None for everywhere.
-
-    Raises:
-        InputError: if it cannot be started.
     """
     try:
         context = rs.context() if context is None else context

@@ -117,11 +117,7 @@ def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
 
 
 def _texture(visual: object) -> tuple[Array | None, npt.NDArray[np.uint8] | None]:
-    """Return the texture coordinates (v, 2) and the image (h, w, 3) of a trimesh; None if missing.
-
-    Raises:
-        ValueError: if the image has too many pixels.
-    """
+    """Return the texture coordinates (v, 2) and the image (h, w, 3) of a trimesh; None if missing."""
     uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
     images = [getattr(material, name, None) for name in ("baseColorTexture", "image")]
     image = next((image for image in images if image is not None), None)

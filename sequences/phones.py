@@ -166,11 +166,7 @@ def images_of_transforms(path: Path) -> FoundImages | None:
 
 
 def _listed(root: Path, entry: Node) -> Path:
-    """Return an image of a folder by its entry in a list.
-
-    Raises:
-        InputError: if it is not there, or lies elsewhere.
-    """
+    """Return an image of a folder by its entry in a list."""
     name = Path(entry.text())
     path = root / name
     if name.is_absolute() or ".." in name.parts:

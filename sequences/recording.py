@@ -126,11 +126,7 @@ _RANGES = {"step_deg": (-360.0, 360.0), "sigma_deg": (0.0, 180.0), "shift_m": (0
 
 
 def _motion(node: Node) -> dict[str, object]:
-    """Return the entry `motion` of `sequence.json` after a check of everything in it.
-
-    Raises:
-        InputError: if a key or the kind is not known, or a value cannot be.
-    """
+    """Return the entry `motion` of `sequence.json` after a check of everything in it."""
     values: dict[str, object] = {}
     for key, entry in node.items().items():
         if key == "kind":
@@ -147,11 +143,7 @@ def _motion(node: Node) -> dict[str, object]:
 
 
 def _poke(node: Node) -> dict[str, object]:
-    """Return one entry of `pokes`, in camera coordinates.
-
-    Raises:
-        InputError: if something is missing, not known, or cannot be.
-    """
+    """Return one entry of `pokes`, in camera coordinates."""
     known = ("point_m", "direction", "length_m")
     for key, entry in node.items().items():
         if key not in known:
@@ -177,7 +169,6 @@ class ImagePair(Generic[Stamp]):
     time_s: float
     """Time of the depth image in s."""
     depth: Stamp
-    """The depth image."""
     colour: Stamp | None
     """The colour image; None if none is near enough in time."""
 

@@ -253,11 +253,7 @@ def field_of_view_deg(size_px: int, focal_px: float) -> float:
 
 
 def _checked(sequence: AbstractSequence, camera: Camera) -> Camera:
-    """Return a camera that can be one.
-
-    Raises:
-        InputError: if its focal length is far too short for its images.
-    """
+    """Return a camera that can be one."""
     for name, focal_px, size_px in (("fx", camera.fx, camera.width), ("fy", camera.fy, camera.height)):
         if field_of_view_deg(size_px, focal_px) > WIDEST_FIELD_DEG:
             raise InputError(
@@ -283,11 +279,7 @@ def _scatter(depth_m: Float32Array) -> float:
 
 
 def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
-    """Reject depth that cannot be in its given unit.
-
-    Raises:
-        InputError: if it is.
-    """
+    """Reject depth that cannot be in its given unit."""
     if NEAREST_M <= middle_m <= FARTHEST_M:
         return
     in_metres = middle_m < NEAREST_M and NEAREST_M <= middle_m * 1000.0 <= FARTHEST_M

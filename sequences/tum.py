@@ -129,11 +129,7 @@ def _tum_truth(path: Path, times_s: Sequence[float]) -> dict[int, Array] | None:
 
 
 def _list(path: Path, words: int) -> list[tuple[float, list[str]]]:
-    """Return the time and the other words of each line that is no comment.
-
-    Raises:
-        InputError: if a line has too few words or no time, or times do not grow.
-    """
+    """Return the time and the other words of each line that is no comment."""
     lines: list[tuple[float, list[str]]] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -153,11 +149,7 @@ def _list(path: Path, words: int) -> list[tuple[float, list[str]]]:
 
 
 def _listed(root: Path, by: str, name: str) -> Path:
-    """Return an image file named in a list.
-
-    Raises:
-        InputError: if there is none, or its name leads out of the sequence.
-    """
+    """Return an image file named in a list."""
     name = name.strip()
     if not name.isprintable():
         raise InputError(f"{root / by}: names an image with control characters; correct it there.")

@@ -30,7 +30,6 @@ class Video:
     """A video whose images are read one after the other: to go back is to begin again."""
 
     def __init__(self, path: Path) -> None:
-        """Take the file."""
         self.path = path
         self._lock, self._next = threading.Lock(), 0
         self._images: Iterator[Any] = iter(())

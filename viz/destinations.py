@@ -95,7 +95,6 @@ class Shown:
     """What viewers are shown, sent from a thread of its own: Rerun 0.41 waits for a viewer that is 400 MB behind."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
-        """Take a stream to viewers."""
         self._recording = recording
         self._waiting: queue.Queue[Callable[[rr.RecordingStream], object] | None] = queue.Queue(_QUEUED)
         self._behind = False

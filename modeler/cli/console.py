@@ -155,7 +155,6 @@ class Interrupt:
         self._listening = _handled(signal.SIGINT, self._note)
 
     def __enter__(self) -> Interrupt:
-        """Install the handler of Ctrl-C."""
         self._before = signal.getsignal(signal.SIGINT) or signal.default_int_handler
         self._listening.__enter__()
         return self
@@ -163,7 +162,6 @@ class Interrupt:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Restore the handler of Ctrl-C."""
         self._listening.__exit__(kind, error, trace)
 
     @property
@@ -244,7 +242,6 @@ class Console:
         self._said_s = time.monotonic()
 
     def __enter__(self) -> Console:
-        """Show the bar."""
         self._bar.start()
         if self._address is not None:
             self._say(f"watch at {self._address}")

@@ -84,7 +84,6 @@ class Pose:
     """Standard deviation of its place."""
 
     def __post_init__(self) -> None:
-        """Check that it is a rigid motion."""
         if len(self.new_from_last) != 16:
             raise ValueError("new_from_last must have 16 numbers")
         if not se3.is_rigid(np.reshape(self.new_from_last, (4, 4)), tolerance=1e-3, farthest_m=1e3):

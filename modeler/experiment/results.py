@@ -31,7 +31,6 @@ class ModelScore:
     """How far one model is from the true surface."""
 
     run: str
-    """The run."""
     poses: Poses
     """Of whose poses the model is made: the run's own, or the true ones."""
     over: Over

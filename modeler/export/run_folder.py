@@ -39,7 +39,6 @@ class RunFolder:
     """
 
     path: Path
-    """The folder."""
     already: int = 0
     """Number of frames of a resumed run: its files are kept until that is reached again."""
     pace: Pace = field(default_factory=Pace, init=False, repr=False)

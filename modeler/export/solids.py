@@ -34,7 +34,6 @@ class Body:
     """Physical properties of a rigid body of uniform density."""
 
     mass_kg: float
-    """Mass."""
     centre_m: Array
     """(3,) centre of mass in the frame of the mesh."""
     inertia_kg_m2: Array

@@ -76,11 +76,7 @@ def known_object(path: str | Path, unit: Unit | None = None) -> KnownObject:
 
 
 def _of_bop(path: Path, scale_m: float) -> Symmetries | None:
-    """Return the symmetries that the entry of a model in BOP's `models_info.json` names; None where it names none.
-
-    Raises:
-        InputError: if they are not in BOP's format.
-    """
+    """Return the symmetries that the entry of a model in BOP's `models_info.json` names; None where it names none."""
     info, digits = path.with_name(MODELS_INFO), re.search(r"(\d+)$", path.stem)
     entries = read_json(info)
     number = str(int(digits.group(1))) if digits else "1"

@@ -50,7 +50,6 @@ class Preset:
     """One export for one program."""
 
     run_folder: Path
-    """The run."""
     out: Path
     """Folder to write."""
     purpose: Purpose

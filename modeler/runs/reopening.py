@@ -43,7 +43,6 @@ class Part:
     report: Mapping[str, Any]
     """Its report, with its own frame numbers."""
     sequence: AbstractSequence
-    """The sequence."""
     offset: int = 0
     """Offset of its frame numbers in the joined run."""
     later_s: float = 0.0

@@ -28,7 +28,6 @@ class TrackFolder:
     """Where a track is written, at most a tenth of the time as it goes, and complete at the end."""
 
     path: Path
-    """The folder."""
     model: str
     """Path of the model, as given."""
     sequence: str

@@ -32,7 +32,6 @@ class BuildStep:
     """The choice of the prior, and the embedded viewer."""
 
     def __init__(self, page: Page, panel: ui.element) -> None:
-        """Prepare the step."""
         self.page, self.panel = page, panel
         self._shown = ""
 

@@ -54,7 +54,6 @@ class CaptureStep:
     """Following a capture."""
 
     def __init__(self, page: Page, panel: ui.element) -> None:
-        """Prepare the step."""
         self.page, self.panel = page, panel
         self._shown = ""
 

@@ -60,7 +60,6 @@ class CheckStep:
     """The verdict on the latest run."""
 
     def __init__(self, page: Page, panel: ui.element) -> None:
-        """Prepare the step."""
         self.page, self.panel = page, panel
 
     def draw(self, scan: Scan) -> None:
@@ -170,7 +169,6 @@ class ExportStep:
     """What is taken away."""
 
     def __init__(self, page: Page, panel: ui.element) -> None:
-        """Prepare the step."""
         self.page, self.panel = page, panel
 
     def draw(self, scan: Scan) -> None:

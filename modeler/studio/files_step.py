@@ -27,7 +27,6 @@ class FilesStep:
     """Choosing a capture."""
 
     def __init__(self, page: Page, panel: ui.element) -> None:
-        """Prepare the step."""
         self.page, self.panel = page, panel
         self.place = Path.cwd() if page.studio.place is None else page.studio.place
 
@@ -73,7 +72,6 @@ class ScansStep:
     """The gallery."""
 
     def __init__(self, page: Page, panel: ui.element) -> None:
-        """Prepare the step."""
         self.page, self.panel = page, panel
 
     def draw(self) -> None:

@@ -30,7 +30,6 @@ class ObjectStep:
     """The frames with the outline of the object, and what corrects it."""
 
     def __init__(self, page: Page, panel: ui.element) -> None:
-        """Prepare the step."""
         self.page, self.panel = page, panel
         self.frame, self.tool, self.brush_px = 0, "Box", float(_BRUSH_PX[1])
         self._points: list[tuple[float, float]] = []

@@ -35,7 +35,6 @@ class Page:
     """What one browser window shows."""
 
     def __init__(self, studio: Studio, viewers: Viewers) -> None:
-        """Prepare a page of a studio."""
         self.studio, self.viewers = studio, viewers
         self.step = STEPS[0]
         self._seen = (-1, -1)

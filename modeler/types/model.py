@@ -70,7 +70,6 @@ class Step:
     solution: Solution
     """All poses so far."""
     make_model: Callable[[], ObjectModel | None] = no_model
-    """Makes `model`."""
     edges_so_far: tuple[Edge, ...] = ()
     """Every edge so far, accepted or not, in order."""
     views: Mapping[int, RayImage] = field(default_factory=dict)

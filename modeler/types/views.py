@@ -174,11 +174,7 @@ class Frame:
 
 
 def _numbers(name: str, image: npt.ArrayLike) -> np.ndarray:
-    """Return an image as an array of its own.
-
-    Raises:
-        InputError: if it is none of real numbers.
-    """
+    """Return an image as an array of its own."""
     try:
         array = np.array(image)
     except ValueError as error:  # rows of different lengths

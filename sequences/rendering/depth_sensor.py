@@ -28,7 +28,6 @@ class LateralJitter:
     """Width of the smoothing that neighbours share."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _not_negative(sigma_px=self.sigma_px, correlation_px=self.correlation_px)
 
     def offsets_px(self, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Array, Array]:
@@ -52,7 +51,6 @@ class DisparityNoise:
     """How fast noise grows on slopes: times 1 + gain·θ²/(π/2 - θ)² at incidence θ."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _not_negative(sigma_px=self.sigma_px, quantum_px=self.quantum_px, correlation_px=self.correlation_px)
         _not_negative(slope_gain=self.slope_gain)
 
@@ -82,7 +80,6 @@ class GrazingLoss:
     """Incidence at which all are lost."""
 
     def __post_init__(self) -> None:
-        """Check the order."""
         if not 0.0 <= self.start_deg < self.end_deg:
             raise ValueError("start_deg must be at least 0 and less than end_deg")
 
@@ -103,7 +100,6 @@ class MixedPixels:
     """Least difference of depth that makes a border."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _share(probability=self.probability)
         _not_negative(min_jump_m=self.min_jump_m)
 
@@ -127,7 +123,6 @@ class RandomLoss:
     """Width of the patches."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _share(probability=self.probability)
         _not_negative(correlation_px=self.correlation_px)
 
@@ -202,7 +197,6 @@ class DepthSensor:
     """Loss anywhere."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if self.baseline_m == 0.0:
             raise ValueError("baseline_m must not be 0")
         if not 0.0 <= self.min_range_m < self.max_range_m:

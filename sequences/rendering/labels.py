@@ -78,7 +78,6 @@ class Cylindrical:
     """Height at which it ends in m; null for that of the highest point."""
 
     def __post_init__(self) -> None:
-        """Check the order."""
         if self.bottom_m is not None and self.top_m is not None and self.bottom_m >= self.top_m:
             raise ValueError("top_m must be more than bottom_m")
 
@@ -243,7 +242,6 @@ class Print:
     """How many things are printed on a chart."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if self.seed < 0 or not 0.0 <= self.contrast <= 1.0 or not 0 <= self.items <= 1000:
             raise ValueError("seed must not be negative, contrast from 0 to 1, items from 0 to 1000")
         if not all(0 <= value <= 255 for value in self.rgb):
@@ -363,12 +361,10 @@ class Label:
     """An image, or one for every face, wrapped around the object; it replaces the shape's colour there."""
 
     image: Print | Picture | Embedded = Print()
-    """The print."""
     wrap: AnyWrap = field(default_factory=Cylindrical)
     """How it is laid around the object."""
 
     def __post_init__(self) -> None:
-        """Check the number of images."""
         if isinstance(self.image, Picture) and len(self.image.paths) not in (1, self.wrap.count):
             raise ValueError(f"paths must hold one image or {self.wrap.count}")
 

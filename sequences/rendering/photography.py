@@ -31,7 +31,6 @@ class Lamp:
     """Radiance of a white surface that faces it; 1 is the maximum of an image."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not np.linalg.norm(self.direction) > 0.0 or self.strength < 0.0:
             raise ValueError("direction must not be zero, strength not negative")
 
@@ -64,7 +63,6 @@ class Photography:
     """Rays per pixel along each side, which are averaged."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         sizes = (
             self.ambient,
             self.highlight,

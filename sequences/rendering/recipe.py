@@ -37,7 +37,6 @@ class Viewpoint:
     """Height above the table of the point looked at."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if not (2 <= self.width <= 8192 and 2 <= self.height <= 8192):
             raise ValueError("width and height must be from 2 to 8192 px")
         if self.focal_px < 1.0 or self.distance_m <= 0.0 or not -90.0 <= self.elevation_deg <= 90.0:
@@ -70,7 +69,6 @@ class Table:
     """Colour."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if min(*self.size_m, self.thickness_m) <= 0.0:
             raise ValueError("size_m and thickness_m must be positive")
 
@@ -88,7 +86,6 @@ class Wall:
     """Colour."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if min(self.size_m) <= 0.0:
             raise ValueError("size_m must be positive")
 
@@ -104,7 +101,6 @@ class Mosaic:
     """How much darker the darkest cells are, 0 to 1."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if self.cell_m <= 0.0 or not 0.0 <= self.contrast <= 1.0:
             raise ValueError("cell_m must be positive and contrast from 0 to 1")
 
@@ -120,7 +116,6 @@ class TurnedOver:
     """Its resting pose from then on: turns about the fixed x, y and z axes, before it is set on the table."""
 
     def __post_init__(self) -> None:
-        """Check the frame."""
         if self.at < 1:
             raise ValueError("at must be at least 1, for frame 0 shows the object as rest_rotation_deg says")
 
@@ -166,7 +161,6 @@ class Recipe:
     """Unit of the depth images."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if self.seed < 0 or self.period_s <= 0.0 or not 1e-3 <= self.depth_unit_mm <= 10.0:
             raise ValueError("seed must not be negative, period_s positive, depth_unit_mm from 0.001 to 10")
         if self.label is not None and self.photography is None:

@@ -61,7 +61,6 @@ class RenderedSequence(AbstractSequence):
     """A sequence that is rendered as it is read; the same recipe gives the same frames."""
 
     recipe: Recipe
-    """The recipe."""
 
     @property
     def name(self) -> str:

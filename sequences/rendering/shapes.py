@@ -130,7 +130,6 @@ class Box:
     """Edge lengths along x, y, z in m."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _positive(size_m=min(self.size_m))
 
     def mesh(self) -> Mesh:
@@ -150,7 +149,6 @@ class Cylinder:
     """Length along z in m."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _positive(radius_m=self.radius_m, height_m=self.height_m)
 
     def mesh(self) -> Mesh:
@@ -172,7 +170,6 @@ class Cone:
     """Radius at the top in m."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _positive(height_m=self.height_m, radius_m=max(self.radius_m, self.top_radius_m))
         _positive(radius_m=min(self.radius_m, self.top_radius_m) + 1e-12)
 
@@ -191,7 +188,6 @@ class Sphere:
     """Radius in m."""
 
     def __post_init__(self) -> None:
-        """Check the size."""
         _positive(radius_m=self.radius_m)
 
     def mesh(self) -> Mesh:
@@ -211,7 +207,6 @@ class Capsule:
     """Length along z between the centres of the ends in m."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _positive(radius_m=self.radius_m, height_m=self.height_m)
 
     def mesh(self) -> Mesh:
@@ -235,7 +230,6 @@ class Torus:
     """Bending angle; 360° closes the ring."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _positive(radius_m=self.radius_m - self.tube_radius_m, tube_radius_m=self.tube_radius_m, arc_deg=self.arc_deg)
 
     def mesh(self) -> Mesh:
@@ -254,7 +248,6 @@ class Lathe:
     """Radius and height in m, from the bottom outside up to the top; it may go on down inside a hollow."""
 
     def __post_init__(self) -> None:
-        """Check the profile."""
         if len(self.profile_m) < 2 or min(radius for radius, _ in self.profile_m) < 0.0:
             raise ValueError("profile_m must have at least two points, none of negative radius")
         profile = np.array(self.profile_m)
@@ -277,7 +270,6 @@ class Extrusion:
     """Height in m."""
 
     def __post_init__(self) -> None:
-        """Check the outline."""
         _positive(height_m=self.height_m)
         if len(self.outline_m) < 3:
             raise ValueError("outline_m must have at least three corners")
@@ -302,7 +294,6 @@ class MeshFile:
     """Metres per unit of the file: 0.001 where it is in mm."""
 
     def __post_init__(self) -> None:
-        """Check the scale."""
         _positive(scale=self.scale)
 
     def mesh(self) -> Mesh:
@@ -316,7 +307,6 @@ class Part:
     """A shape at its place in a compound: stretched, then turned, then shifted."""
 
     shape: AnyShape
-    """The shape."""
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Shift in m."""
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -327,7 +317,6 @@ class Part:
     """Colour; the shape's own without it."""
 
     def __post_init__(self) -> None:
-        """Check the factors and the colour."""
         _positive(stretch=min(self.stretch))
         if self.rgb is not None and not all(0 <= value <= 255 for value in self.rgb):
             raise ValueError("rgb must hold numbers from 0 to 255")
@@ -347,7 +336,6 @@ class Compound:
     """The shapes at their places."""
 
     def __post_init__(self) -> None:
-        """Check that there is something."""
         if not self.parts:
             raise ValueError("parts must not be empty")
 

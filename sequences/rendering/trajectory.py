@@ -42,7 +42,6 @@ class Tabletop:
     """Standard deviation of the lift in one motion from frame to frame in m."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _checked(self.frames, self.step_sigma_deg, self.shift_m, self.wobble_deg, self.wobble_m)
         if self.shift_m > self.reach_m:
             raise ValueError("reach_m must be at least shift_m")
@@ -88,7 +87,6 @@ class Turntable:
     """Standard deviation of the lift in one motion from frame to frame in m."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _checked(self.frames, self.step_sigma_deg, self.wobble_deg, self.wobble_m)
 
     def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:
@@ -115,7 +113,6 @@ class RobotReadings:
     """Standard deviation of a pose's translation along each axis in m."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _checked(1, self.sigma_deg, self.sigma_m)
 
     def camera_from_hand(self, camera_from_model: Array, rng: np.random.Generator) -> Array:
@@ -145,7 +142,6 @@ class Hand:
     """The robot that holds the object and writes `robot.txt`; null for a person."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         _checked(self.frames, self.step_sigma_deg, self.shift_m, self.wander)
 
     def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:
@@ -187,7 +183,6 @@ class Places:
     """The pose of every frame."""
 
     def __post_init__(self) -> None:
-        """Check that there is something."""
         _checked(len(self.poses))
 
     def table_from_object(self, centre_m: Array, rng: np.random.Generator) -> Array:

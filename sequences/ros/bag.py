@@ -278,11 +278,7 @@ def _bounded(chunk: Chunk) -> Chunk:
 
 
 def _check_start(path: Path) -> None:
-    """Refuse a file that does not start as a bag of ROS 1: the library would search for the end of its first line.
-
-    Raises:
-        ValueError: if it does not.
-    """
+    """Refuse a file that does not start as a bag of ROS 1: the library would search for the end of its first line."""
     with open_regular(path) as file:
         if not file.read(len(_ROS1)).startswith(_ROS1):
             raise ValueError("it does not start with #ROSBAG")
