@@ -26,13 +26,7 @@ LEVELS = (0.5, 0.9, 0.95)
 
 
 def true_motion(camera_from_model: Mapping[int, Array], target: int, source: int) -> Array:
-    """Return the true target_from_source (4, 4).
-
-    Args:
-        camera_from_model: (4, 4) by frame number.
-        target: frame number.
-        source: frame number.
-    """
+    """Return the true target_from_source (4, 4)."""
     return camera_from_model[target] @ se3.inverse(camera_from_model[source])
 
 

@@ -160,15 +160,7 @@ def _plausible_axes(points: npt.NDArray[np.float64]) -> list[Axes]:
 def _intrinsics(
     path: Path, clouds: Mapping[int, Path], first: _Cloud, axes: Axes, overrides: Overrides
 ) -> tuple[tuple[Intrinsics, int, int], tuple[str, ...]]:
-    """Return intrinsics, width and height of the camera that saw the clouds, and their source in words.
-
-    Args:
-        path: of the folder, or of the only cloud.
-        clouds: by frame number.
-        first: the first of them, in camera coordinates.
-        axes: of the files.
-        overrides: values that take precedence.
-    """
+    """Return intrinsics, width and height of the camera that saw the clouds, and their source in words."""
     intrinsics, columns, rows = overrides.intrinsics, *first.size
     first_path = next(iter(clouds.values()))
     if rows > 1:
@@ -275,14 +267,7 @@ def _steps(slopes: Array) -> tuple[float, float]:
 def _window(
     clouds: Mapping[int, Path], intrinsics: Intrinsics, axes: Axes, *, whole: bool
 ) -> tuple[Intrinsics, int, int]:
-    """Return intrinsics, width and height of an image that holds the points of all clouds.
-
-    Args:
-        clouds: by frame number.
-        intrinsics: of the camera.
-        axes: of the files.
-        whole: whether the principal point is given, so that pixels count from the image's corner.
-    """
+    """Return intrinsics, width and height of an image that holds the points of all clouds."""
     fx, fy, cx, cy = intrinsics
     lows, highs = [], []
     for path in clouds.values():

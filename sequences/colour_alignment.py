@@ -63,11 +63,7 @@ _LEAST_SHIFT: Final = 2  # px at that size
 
 
 def misalignment(frames: Sequence[Frame]) -> Misalignment | None:
-    """Return where colour is instead of where depth is; None if it is aligned, or edges do not tell.
-
-    Args:
-        frames: some of a sequence, of one camera.
-    """
+    """Return where colour of one camera is instead of where depth is; None if aligned, or edges do not tell."""
     pairs = [_edges(frame, frame.colour) for frame in frames if frame.colour is not None]
     if not pairs or np.mean([depth.sum() for depth, _ in pairs]) < _LEAST_EDGES:
         return None

@@ -198,12 +198,6 @@ def no_depth(folder: Path, wanted: str, formats: str = FORMATS) -> InputError:
 def check_same_size(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
     """Refuse a depth image of another size than one with the same intrinsics.
 
-    Args:
-        path: the depth image.
-        size: its (h, w).
-        alike: the other.
-        said: source of the common intrinsics, and advice.
-
     Raises:
         InputError: if it is.
     """

@@ -110,11 +110,6 @@ def partners(
     Images belong together by name; by frame number; by the time stamps in their names, the nearest within half the
     time from one depth image to the next; or, of as many images, by order.
 
-    Args:
-        found: images by name.
-        depth: names of the depth images.
-        what: what the images are, for messages.
-
     Raises:
         InputError: if nothing matches them.
     """

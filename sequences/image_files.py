@@ -198,12 +198,7 @@ def graded(path: Path) -> bool:
 def object_and_occluder(
     labels: npt.NDArray[np.uint8], occluder: BoolArray | None
 ) -> tuple[BoolArray, BoolArray | None]:
-    """Return the masks (h, w) of an object and of its occluder; None if not given.
-
-    Args:
-        labels: (h, w), of `read_labels`.
-        occluder: (h, w) of a file of its own.
-    """
+    """Return the masks (h, w) of an object and of its occluder; None if not given."""
     marked = labels == OCCLUDED
     if not marked.any():
         return labels != 0, occluder

@@ -268,11 +268,6 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
 
     Depth of whole numbers is in mm unless the file of intrinsics or the user gives another unit.
 
-    Args:
-        path: the folder.
-        found: its images.
-        overrides: values that take precedence over its files.
-
     Raises:
         InputError: if it is not readable as such.
     """

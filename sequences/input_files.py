@@ -24,11 +24,6 @@ from modeler.types import Array, InputError
 def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
     """Turn exceptions of a library on a file into one line.
 
-    Args:
-        path: the file.
-        what: what it should be, as in "bag".
-        advice: what to do about it.
-
     Raises:
         InputError: in place of anything else.
     """
@@ -72,10 +67,6 @@ def is_there(path: Path) -> bool:
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     """Return the images of a folder by stem, without hidden files.
-
-    Args:
-        folder: may be missing.
-        suffixes: in lower case, such as `.png`.
 
     Raises:
         InputError: if the folder may not be read, or two images share a name.
@@ -274,10 +265,6 @@ def _from_yaml(text: str) -> object:
 
 def read_text(path: Path, kind: str = "text") -> str:
     """Return the text of a file of at most 64 MB.
-
-    Args:
-        path: the file.
-        kind: what it should be, for error messages.
 
     Raises:
         InputError: if it is no regular file, missing, larger, or not UTF-8.

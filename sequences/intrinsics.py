@@ -141,12 +141,7 @@ class CameraFacts:
         return said + self.doubts(size)
 
     def unit(self, overrides: Overrides, usual: tuple[float, str]) -> tuple[float, str]:
-        """Return the millimetres per unit of depth, and its source.
-
-        Args:
-            overrides: values that take precedence.
-            usual: the default and its source.
-        """
+        """Return the millimetres per unit of depth, and its source."""
         if overrides.depth_scale_mm is not None:
             return overrides.depth_scale_mm, "`depth_scale_mm`"
         return usual if self.unit_mm is None else (self.unit_mm, self.by)
@@ -163,10 +158,6 @@ class CameraFacts:
 
 def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
     """Return the camera of a folder of images; None without intrinsics.
-
-    Args:
-        folder: where to look.
-        overrides: values that take precedence.
 
     Raises:
         InputError: if a file of intrinsics cannot be read.
@@ -239,10 +230,6 @@ def _describes_camera(node: Node) -> bool:
 def camera_of(node: Node, name: str) -> CameraFacts:
     """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name.
 
-    Args:
-        node: the contents of a file.
-        name: of the file.
-
     Raises:
         InputError: if it describes no camera.
     """
@@ -262,12 +249,7 @@ def camera_of(node: Node, name: str) -> CameraFacts:
 
 
 def cameras_of_frames(path: Path, stems: Iterable[str], size: tuple[int, int]) -> dict[str, CameraFacts]:
-    """Return the camera of each image by its name, as Polycam and `transforms.json` have them; {} without.
-
-    Args:
-        path: the folder.
-        stems: names of the depth images.
-        size: (width, height) of depth, which may have fewer pixels than the images the cameras are of.
+    """Return the camera of each depth image of (width, height) by name, as Polycam and `transforms.json` have it.
 
     Raises:
         InputError: if a file of a camera cannot be read.

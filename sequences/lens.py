@@ -93,12 +93,6 @@ _BROWN_COUNT = 8
 def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where: str) -> Lens:
     """Return the lens that a file describes.
 
-    Args:
-        camera: the camera.
-        distortion: coefficients in the model's order.
-        model: name of the distortion model in the file.
-        where: the file, for error messages.
-
     Raises:
         InputError: if there is distortion by an unknown model.
     """

@@ -192,11 +192,6 @@ _TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")
 def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveSequence:
     """Start a camera.
 
-    Args:
-        serial: its serial number; empty for the only one.
-        overrides: values that take precedence over the camera's.
-        context: where to look for cameras; everywhere without it.
-
     Raises:
         InputError: if the library is not installed, or no such camera gives images.
     """
@@ -209,13 +204,7 @@ def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveS
 
 
 def opened(camera: RunningCamera, overrides: Overrides, warm_up: int = WARM_UP) -> LiveSequence:
-    """Return the images of a camera that was started, which is stopped once it is forgotten.
-
-    Args:
-        camera: as its library describes it.
-        overrides: values that take precedence.
-        warm_up: number of images to drop.
-    """
+    """Return the images of a camera that was started, which is stopped once it is forgotten."""
     if overrides.intrinsics is not None:
         size = camera.lens.camera.width, camera.lens.camera.height
         camera = replace(camera, lens=Lens(Camera(*size, *overrides.intrinsics), ()))
@@ -239,13 +228,7 @@ def _check_present(rs: Any, context: Any, serial: str) -> None:
 
 
 def _started(rs: Any, serial: str, context: Any) -> RunningCamera:
-    """Start the RealSense camera with a serial number, or the only one.
-
-    Args:
-        rs: the library.
-        serial: may be empty.
-        context: where to look for cameras; None for everywhere.
-    """
+    """Start the RealSense camera with a serial number, or the only one."""
     try:
         context = rs.context() if context is None else context
         _check_present(rs, context, serial)

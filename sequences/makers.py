@@ -24,10 +24,6 @@ _OAK_PX: Final = (640, 400)  # width and height of depth and colour: stereo of a
 def orbbec(ob: Any, serial: str) -> RunningCamera:
     """Start an Orbbec camera.
 
-    Args:
-        ob: the library, `pyorbbecsdk`.
-        serial: its serial number; empty for the first.
-
     Raises:
         InputError: if it cannot be started.
     """
@@ -76,10 +72,6 @@ def orbbec(ob: Any, serial: str) -> RunningCamera:
 
 def oak(dai: Any, serial: str) -> RunningCamera:
     """Start an OAK camera, with depth on the pixels of its colour camera, from whose images the lens is taken out.
-
-    Args:
-        dai: the library, `depthai` from version 3.
-        serial: its identifier or address; empty for the first.
 
     Raises:
         InputError: if it cannot be started.
@@ -132,10 +124,6 @@ def oak(dai: Any, serial: str) -> RunningCamera:
 def azure(k4a: Any, serial: str) -> RunningCamera:
     """Start an Azure Kinect, or with Orbbec's library in place of Microsoft's a Femto.
 
-    Args:
-        k4a: the library, `pyk4a`.
-        serial: its serial number; empty for the first.
-
     Raises:
         InputError: if it cannot be started.
     """
@@ -183,11 +171,6 @@ LIBRARIES: Final[Mapping[str, tuple[str, str, Callable[[Any, str], RunningCamera
 
 def open_camera_of(maker: str, serial: str, overrides: Overrides) -> LiveSequence:
     """Start a camera.
-
-    Args:
-        maker: one of `LIBRARIES`.
-        serial: its serial number; empty for the first.
-        overrides: values that take precedence over the camera's.
 
     Raises:
         InputError: if the library is not installed, or no such camera gives images.

@@ -92,11 +92,6 @@ def _joined_uv(meshes: list[Mesh]) -> Array | None:
 def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
     """Return the triangles of a mesh file (PLY, OBJ, STL, GLB, ...), its lengths times `scale` in m.
 
-    Args:
-        path: the file.
-        scale: metres per unit of the file.
-        textured: whether its texture coordinates and the image in it are wanted.
-
     Raises:
         InputError: if the file is missing, cannot be read or holds no triangle.
     """

@@ -45,9 +45,6 @@ def flat_shares(frames: Sequence[Frame]) -> tuple[float, float]:
 
     In ray coordinates (w, h), a plane is a linear function for the inverse of depth along the axis. Distances along the
     ray are linear once multiplied by `stretch`: a table of 60° is bent by 15 % otherwise.
-
-    Args:
-        frames: some of a sequence.
     """
     shares = [found for frame in frames if (found := _flat_shares(frame)) is not None]
     if not shares:

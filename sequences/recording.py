@@ -188,10 +188,6 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
         """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured.
 
-        Args:
-            index: frame number, for error messages.
-            stamp: which image of the stream.
-
         Raises:
             InputError: if it cannot be read.
         """
@@ -199,11 +195,6 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
     @abstractmethod
     def colour_at(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
         """Return colour (h, w, 3) as RGB at the pixels of a depth image (h, w) without distortion; None without.
-
-        Args:
-            index: frame number, for error messages.
-            stamp: which image of the stream.
-            depth_m: the depth image.
 
         Raises:
             InputError: if it cannot be read.

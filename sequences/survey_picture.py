@@ -21,10 +21,6 @@ _GAP = 4
 def write_picture(path: Path, frames: Sequence[Frame]) -> None:
     """Write a PNG with a row a frame: depth from near (light) to far (dark), colour or depth with edges, the mask.
 
-    Args:
-        path: the file, which is replaced.
-        frames: at least one.
-
     Raises:
         InputError: if it cannot be written.
     """

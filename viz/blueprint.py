@@ -28,11 +28,7 @@ def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb
 
 
 def tracking_layout(first: RayImage | None) -> rrb.Blueprint:
-    """Return the layout of an object that is tracked: the frame with its outline, and the model among the points.
-
-    Args:
-        first: the first view in which it was placed, which sets the viewpoint; None before there is one.
-    """
+    """Return the layout of an object that is tracked: the frame with its outline, and the model among the points."""
     words = rrb.TextDocumentView(origin=entities.TRACKED_WORDS, name="In words")
     eye = _near(first, FROM_THE_SIDE, 4.2)
     model = _spatial("Model in the frame's points", [f"{entities.TRACKED}/**"], eye, origin=entities.TRACKED)

@@ -36,11 +36,7 @@ def draw_next(belief: Belief, found: Suggestions) -> Drawing:
 
 
 def tab(first: RayImage | None) -> rrb.Container:
-    """Return a layout of observed and unseen surface, the frame, the list, and the values over time.
-
-    Args:
-        first: the first view, which sets the viewpoint; None before there is one.
-    """
+    """Return a layout of observed and unseen surface, the frame, the list, and the values over time."""
     cells = rrb.Spatial3DView(
         origin=entities.WORLD,
         contents=[SEEN_CELLS, UNSEEN_CELLS, entities.CAMERAS, entities.POSITION_3_SIGMA],

@@ -84,12 +84,7 @@ def draw_legend(name: str, facts: Mapping[str, object]) -> Drawing:
 
 
 def run_words(name: str, facts: Mapping[str, object]) -> str:
-    """Return name and settings of the run in Markdown.
-
-    Args:
-        name: of the sequence.
-        facts: settings, by name.
-    """
+    """Return name and settings of the run in Markdown."""
     rows = [f"| {key.replace('_', ' ')} | {_fact(value)} |" for key, value in facts.items()]
     return "\n".join([f"### {name}", "", "| | |", "|---|---|", *rows] if rows else [f"### {name}"])
 

@@ -65,14 +65,7 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
 
 
 def intensity_gradients(cloud: Cloud, tree: KDTree, radius_m: float, neighbours: int) -> Array:
-    """Return the gradients (n, 3) of intensity per m along the surface, by least squares in the tangent planes.
-
-    Args:
-        cloud: points with intensity.
-        tree: of the points.
-        radius_m: largest distance of neighbours.
-        neighbours: largest number of neighbours, the point itself included.
-    """
+    """Return the gradients (n, 3) of intensity per m along the surface, by least squares in the tangent planes."""
     assert cloud.intensity is not None
     distances, indices = tree.query(cloud.points_m, k=neighbours, distance_upper_bound=radius_m)
     known = np.isfinite(distances)

@@ -54,13 +54,7 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
         return self.icp.refine(*clouds, self.search(*clouds, initial))
 
     def search(self, source: Cloud, target: Cloud, fallback: Array) -> Array:
-        """Return the motion (4, 4) that KISS-Matcher finds; `fallback` if it finds none.
-
-        Args:
-            source: points to transform.
-            target: points to align them with.
-            fallback: (4, 4).
-        """
+        """Return the motion (4, 4) that KISS-Matcher finds; `fallback` (4, 4) if it finds none."""
         matcher: Any = importlib.import_module("kiss_matcher")  # its types are known only if it is installed
         (unit_m,) = cube_edges_m(source, target, (self.voxel,))  # it rejects voxels below 5 mm
         centres_m = source.points_m.mean(axis=0), target.points_m.mean(axis=0)

@@ -183,12 +183,7 @@ def open_log(path: Path) -> BinaryIO:
 
 
 def standing(job: Job, note: dict[str, Any] | None = None) -> Standing:
-    """Return the progress of a job from its files.
-
-    Args:
-        job: with the settings as they are now.
-        note: its state; None: read from its file.
-    """
+    """Return the progress of a job from its files."""
     note = read_note(job.note) if note is None else note
     if not note:
         return "new"

@@ -140,12 +140,7 @@ class Build:
         }
 
     def advice(self, prior: AbstractPrior, report: Mapping[str, Any]) -> list[str]:
-        """Return in words, with commands, what to do about a model that cannot be trusted.
-
-        Args:
-            prior: of the run.
-            report: of the run.
-        """
+        """Return in words, with commands, what to do about a model that cannot be trusted."""
         from modeler.verdict.advice import remedies
 
         found = []

@@ -212,13 +212,7 @@ def _offsets(text: str) -> tuple[int, ...]:
 
 
 def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
-    """Evaluate the models of runs, write `models.json` and `models.csv`, print a table and return the exit status.
-
-    Args:
-        runs: run folders of sequences whose poses and surface are known.
-        out: folder, created if missing.
-        seed: of the points drawn on the surfaces.
-    """
+    """Evaluate the models of runs, write `models.json` and `models.csv`, print a table and return the exit status."""
     from modeler.experiment import models_csv, models_json
     from modeler.export import write_atomically
     from modeler.runs.scoring import scores_of

@@ -123,10 +123,6 @@ def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:
     A sequence that the folder knows keeps its name. Others are called as their file or folder, and where that name is
     taken, with a few digits more, which depend on nothing but their path.
 
-    Args:
-        rows: the sequences.
-        out: folder of the batch.
-
     Raises:
         InputError: if a name is given that cannot be one, or is given twice.
     """

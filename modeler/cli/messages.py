@@ -81,10 +81,6 @@ def split(arguments: Sequence[str]) -> tuple[Messages, list[str]]:
 def kept(asked: Messages, arguments: Sequence[str]) -> Iterator[None]:
     """Print and keep the messages of the block as asked.
 
-    Args:
-        asked: as the command line says.
-        arguments: that line, for the head of the log.
-
     Raises:
         Wrong: if the file cannot be appended to, or is something else than such a log.
     """

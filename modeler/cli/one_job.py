@@ -37,11 +37,7 @@ def main() -> int:
 
 
 def begin(words: str) -> tuple[Job, dict[str, Any]]:
-    """Return a job and its initial note, which is written; results of builds with other options are deleted.
-
-    Args:
-        words: the job in JSON.
-    """
+    """Return a job and its initial note, which is written; results of builds with other options are deleted."""
     from modeler.batch.jobs import Job, fingerprint, read_note, standing, write_note
 
     values = json.loads(words)

@@ -123,11 +123,6 @@ def registrar(
 ) -> AbstractRegistrar:
     """Return the registration method of a name.
 
-    Args:
-        method: its name.
-        colour: whether it may compare colours.
-        device: where `paper` samples and scores poses; None = chosen for each job.
-
     Raises:
         InputError: if it cannot be there, or is not installed.
     """
@@ -294,12 +289,7 @@ def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) 
 
 
 def _own_prior(name: str, arguments: Sequence[str]) -> AbstractPrior:
-    """Return a prior that a user wrote.
-
-    Args:
-        name: `module:Class`, the module importable from the current folder.
-        arguments: its fields, each as `name=value`.
-    """
+    """Return a prior that a user wrote."""
     module_name, _, class_name = name.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())

@@ -111,11 +111,6 @@ class PriorOptions:
     def given(self, name: str, accepted: Collection[str], of: Mapping[str, Collection[str]]) -> dict[str, Any]:
         """Return the parameters that were given, by field name.
 
-        Args:
-            name: the prior's.
-            accepted: names of the parameters that it has.
-            of: those of each prior, by its name.
-
         Raises:
             InputError: if a parameter of another prior was given, or a value that is none.
         """

@@ -192,14 +192,7 @@ class Experiment:
     def _registered(
         self, method: AbstractRegistrar, source: RayImage, target: RayImage, trusted: Sequence[Edge]
     ) -> Posterior | str:
-        """Return a method's answer, as `Modeler.register` gives it, or why the prior has none to begin with.
-
-        Args:
-            method: what registers them.
-            source: a view.
-            target: the view that it is registered to.
-            trusted: the answers before that the method stands by, for a prior that learns.
-        """
+        """Return a method's answer, as `Modeler.register` gives it, or why the prior has none to begin with."""
         try:
             prior = self.prior.learned(Solution(), trusted) if self.learn else self.prior
             density = prior.between(source, target)
@@ -224,10 +217,6 @@ def viewed(pairs: Iterable[Pair], view: Callable[[int], _Seen]) -> Iterator[tupl
 
     A view is made when it is first asked for and let go after the last pair of the same offset that has it, so that of
     a sequence however long about as many are kept as the offset counts frames; of a closed one, twice as many.
-
-    Args:
-        pairs: offset by offset.
-        view: makes the view of a frame number.
     """
     for _, group in groupby(pairs, key=lambda pair: pair.offset):
         together = list(group)
@@ -244,13 +233,7 @@ def viewed(pairs: Iterable[Pair], view: Callable[[int], _Seen]) -> Iterator[tupl
 
 
 def sparse_view(view: RayImage, count: int, rng: np.random.Generator) -> RayImage:
-    """Return a view with at most `count` of its surface points; its images stay whole.
-
-    Args:
-        view: a frame made ready.
-        count: points to keep.
-        rng: chooses them.
-    """
+    """Return a view with at most `count` of its surface points; its images stay whole."""
     total = len(view.points_m)
     kept = np.sort(rng.permutation(total)[:count])
     layers = {name: layer[kept] if layer.shape == (total,) else layer for name, layer in view.layers.items()}
@@ -376,13 +359,7 @@ class Summary:
 
 
 def summaries(trials: Iterable[Trial], success_deg: float, *, loops: bool = False) -> list[Summary]:
-    """Return a row for each sequence, offset and method, in the order in which they appear.
-
-    Args:
-        trials: to summarise.
-        success_deg: rotation error below which one counts as right.
-        loops: whether the trials of a row are the steps round a closed turn, in order.
-    """
+    """Return a row for each sequence, offset and method, in the order in which they appear."""
     groups: dict[tuple[str, int, str], list[Trial]] = {}
     for trial in trials:
         groups.setdefault((trial.sequence, trial.offset, trial.method), []).append(trial)

@@ -94,11 +94,6 @@ class _Candidate:
 def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore]:
     """Compare a run's model, and one that `fuser` makes of the same frames with their true poses, with the truth.
 
-    Args:
-        modelled: the run.
-        fuser: makes the other model.
-        seed: of the points drawn on the surfaces.
-
     Raises:
         InputError: where no view has a true pose, or a model or the truth has no surface.
     """

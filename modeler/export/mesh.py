@@ -324,13 +324,7 @@ class Texture:
 
 
 def textured(model: ObjectModel, paint: Paint, side_px: int) -> tuple[ObjectModel, Texture]:
-    """Return the model with vertices doubled along seams, and its texture.
-
-    Args:
-        model: the mesh.
-        paint: gives points of the surface their colours.
-        side_px: of the image, a square that the surface fills.
-    """
+    """Return the model with vertices doubled along seams, and its texture."""
     import xatlas
 
     corners = model.vertices_m[model.triangles]

@@ -49,13 +49,7 @@ class Pairs:
     """It is made when there is something to keep."""
 
     def get(self, source: int, target: int, key: tuple[str, str]) -> Posterior | None:
-        """Return the stored result, to the bit, or that of a complete run under another prior; None if there is none.
-
-        Args:
-            source: frame number.
-            target: frame number.
-            key: digests of views and method, and of the prior.
-        """
+        """Return the stored result, to the bit, or that of a complete run under another prior; None without any."""
         for path in (self._path(source, target, key), self._done / self._name(source, target, key)):
             if (found := _read(path)) is not None:
                 return found

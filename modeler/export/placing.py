@@ -170,10 +170,7 @@ UpSource = Literal["support", "ring", "camera"]
 
 
 def standing(up: Array) -> Array:
-    """Return right, down and forward (3, 3), as columns, of a view from the camera's side in which `up` is up.
-
-    Args:
-        up: (3,) unit, in camera coordinates.
+    """Return right, down and forward (3, 3), as columns, of a view from the camera's side in which `up` (3,) is up.
 
     Returns:
         The identity, which is the camera's own view, if the camera looks along `up`.
@@ -200,20 +197,13 @@ def model_upright(report: Mapping[str, Any]) -> Array:
 
     The support is level in it; without one, the ring of cameras around it; without a ring, it is the view of the first
     frame's camera.
-
-    Args:
-        report: of a run in which frames were accepted.
     """
     up, source = model_up(report)
     return np.eye(3) if source == "camera" else standing(up)
 
 
 def model_up(report: Mapping[str, Any]) -> tuple[Array, UpSource]:
-    """Return the up direction (3,) in the object frame of a run, and its source.
-
-    Args:
-        report: of a run in which frames were accepted.
-    """
+    """Return the up direction (3,) in the object frame of a run, and its source."""
     up = report.get("up")  # which reports of earlier versions have not
     if up is not None:
         up = np.array(up, dtype=np.float64)

@@ -67,12 +67,7 @@ class PosedImages:
         )
 
     def observations(self, number: int, tolerance_m: float) -> tuple[npt.NDArray[np.int64], Array]:
-        """Return which points a frame sees and where (k, 2), in px as `Camera` measures them.
-
-        Args:
-            number: of the frame.
-            tolerance_m: largest difference between the depth of a point and that measured there.
-        """
+        """Return which points a frame sees and where (k, 2), in px as `Camera` measures them."""
         frame, world_from_camera = self.frames[number], self.world_from_camera[number]
         points_m = se3.transform(se3.inverse(world_from_camera), self.points_m)
         facing = ((self.points_m - world_from_camera[:3, 3]) * self.normals).sum(axis=1) < 0.0
@@ -146,11 +141,6 @@ def write_colmap(data: PosedImages, folder: Path, tolerance_m: float) -> int:
     """Write RGBA images, masks, and a sparse model as text and binary, and return its number of points.
 
     Its points are those of the surface that a frame sees, and their observations are projections, no matched features.
-
-    Args:
-        data: frames, poses, and points.
-        folder: where to write.
-        tolerance_m: largest difference between the depth of a point and that measured where it is seen.
 
     Raises:
         InputError: if a file cannot be written.

@@ -84,12 +84,7 @@ class RunMeta:
 
 
 def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
-    """Return the report after a step, in values that JSON holds: numbers that are not finite are None.
-
-    Args:
-        step: the latest.
-        meta: everything else.
-    """
+    """Return the report after a step, in values that JSON holds: numbers that are not finite are None."""
     solution, views, covariances = step.solution, dict(step.views), dict(step.solution.covariances.items())
     if step.view is not None:  # also where the frame was left out
         views[step.frame.index] = step.view
@@ -147,13 +142,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
 def _camera(
     given: Mapping[str, float | str] | None, solution: Solution, views: Mapping[int, RayImage]
 ) -> dict[str, Any] | None:
-    """Return the estimate of the camera; None if the given one is exact.
-
-    Args:
-        given: by the file that the run was made with, as in report.json.
-        solution: with the estimate from its loops.
-        views: by frame number.
-    """
+    """Return the estimate of the camera; None if the given one is exact."""
     focal = solution.focal
     if focal is None:
         return None if given is None else dict(given)

@@ -76,10 +76,6 @@ class RunFolder:
     def check(self, *, overwrite: bool = False, resume: bool = False) -> None:
         """Refuse to make a run where other things are, or, unless asked for, where another run is.
 
-        Args:
-            overwrite: whether a run there may be replaced.
-            resume: whether it may be continued.
-
         Raises:
             InputError: if that is so.
         """

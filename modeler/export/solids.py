@@ -419,11 +419,7 @@ def settled_in_mujoco(scene: Path) -> Settled:
 
 
 def settled_in_pybullet(urdf: Path, drop_m: float) -> Settled:
-    """Load a URDF in PyBullet and let the object come to rest.
-
-    Args:
-        urdf: the file.
-        drop_m: height of the link's origin at which it starts.
+    """Load a URDF in PyBullet, its link at a height, and let the object come to rest.
 
     Raises:
         ImportError: if PyBullet is not installed.

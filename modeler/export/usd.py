@@ -26,13 +26,6 @@ def write_usd(files: PhysicsFiles, model: ObjectModel, texture: Texture | None, 
     Mass, centre and principal moments of inertia are at the body, convex parts as they are at its colliders, for not
     every program heeds an approximation that it is told to make.
 
-    Args:
-        files: where.
-        model: the mesh that is shown, in the frame of the body.
-        texture: wrapped around it; None: colours of vertices, or grey.
-        body: its mass.
-        parts: its colliders.
-
     Raises:
         ImportError: if usd-core is not installed.
         InputError: if the file cannot be written.

@@ -64,13 +64,7 @@ def loaded(path: Path) -> Any:
 
 
 def mesh_checks(path: Path, *, unit_m: float = 1.0, most_triangles: int) -> Checks:
-    """Return checks that every exported mesh has to pass: size, number and area of its triangles.
-
-    Args:
-        path: the mesh.
-        unit_m: length of its unit.
-        most_triangles: that the program it is for takes.
-    """
+    """Return checks that every exported mesh has to pass: size, number and area of its triangles."""
     mesh = loaded(path)
     corners, triangles = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     size_m = unit_m * np.ptp(corners, axis=0)

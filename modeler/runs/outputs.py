@@ -12,10 +12,6 @@ from modeler.types import InputError
 def check_folder(out: Path, inputs: Iterable[Path]) -> None:
     """Reject a folder that is, or is inside, an input of the command.
 
-    Args:
-        out: folder that the command will create or fill.
-        inputs: files and folders that it reads; missing ones are skipped.
-
     Raises:
         InputError: if writing there would change an input.
     """
@@ -31,11 +27,6 @@ def check_folder(out: Path, inputs: Iterable[Path]) -> None:
 
 def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool) -> None:
     """Reject files that would change an input, and existing files unless `overwrite` is set.
-
-    Args:
-        outs: files that the command is about to write.
-        inputs: files and folders that it reads; missing ones are skipped.
-        overwrite: whether regular files may be replaced.
 
     Raises:
         InputError: if a file may not be written.
@@ -76,12 +67,7 @@ def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resu
 
 
 def run_inputs(runs: Iterable[Path], moved: Iterable[Path] = ()) -> tuple[Path, ...]:
-    """Return run folders with all their inputs: sequences, calibrations, and joined runs.
-
-    Args:
-        runs: run folders; other paths are returned unchanged.
-        moved: where sequences are now.
-    """
+    """Return run folders with all their inputs: sequences, calibrations, and joined runs."""
     from modeler.export import RunFolder
 
     found: dict[Path, None] = {}

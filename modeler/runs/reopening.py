@@ -196,12 +196,7 @@ def _overrides(settings: Mapping[str, Any]) -> Overrides:
 
 
 def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | None) -> AbstractSequence:
-    """Return a sequence with the calibration of its camera.
-
-    Args:
-        sequence: as it was recorded.
-        sensor: file with the noise; None: from the sequence.
-        camera: file with the focal length; None: from the sequence.
+    """Return a sequence with the calibration of its camera, as files with its noise and focal length have it.
 
     Raises:
         InputError: if a file cannot be read.
@@ -212,9 +207,6 @@ def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | N
 
 def estimated_camera(file: Path | None) -> dict[str, float | str] | None:
     """Return the calibration in a camera file as in report.json; None without one.
-
-    Args:
-        file: as `modeler calibrate-camera` wrote it.
 
     Raises:
         InputError: if it cannot be read.

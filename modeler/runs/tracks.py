@@ -54,10 +54,6 @@ class TrackFolder:
     def write(self, found: Sequence[Tracked], *, last: bool = False) -> None:
         """Bring the files up to date.
 
-        Args:
-            found: the object in each frame so far.
-            last: whether there will be no more.
-
         Raises:
             InputError: if a file cannot be written.
         """
@@ -96,13 +92,7 @@ def _pose(pose: PoseGaussian) -> dict[str, list[float]]:
 
 
 def bop_text(found: Sequence[Tracked], scene: int, thing: int) -> str:
-    """Return the results as the BOP toolkit reads them: mm, the overlap as score, frames in which the object is.
-
-    Args:
-        found: the object in each frame.
-        scene: number of the scene.
-        thing: number of the object.
-    """
+    """Return the results as the BOP toolkit reads them: mm, the overlap as score, frames in which the object is."""
     lines = ["scene_id,im_id,obj_id,score,R,t,time"]
     for one in found:
         if one.pose is not None:

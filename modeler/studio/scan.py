@@ -80,11 +80,7 @@ class Choices:
         write_atomically(path, json.dumps(asdict(self), indent=1) + "\n")
 
     def options(self, *, within: bool = True) -> list[str]:
-        """Return them as options of the build.
-
-        Args:
-            within: whether to name the region.
-        """
+        """Return them as options of the build."""
         words = [] if self.prior is None else ["--prior", self.prior]
         if self.prior == "turntable" and self.step_deg is not None:
             words += ["--step-deg", f"{self.step_deg:g}"]
@@ -249,9 +245,6 @@ class Scan:
     def build_jobs(self, *, resume: bool = False) -> list[Job]:
         """Return the build that the choices ask for, and its page; painted masks are written where it reads them.
 
-        Args:
-            resume: whether it goes on with the latest run.
-
         Raises:
             InputError: if the masks cannot be written.
         """
@@ -272,11 +265,7 @@ class Scan:
         return shlex.join(("modeler", "build", str(source), "--out", str(next_run(self.folder)), *self.options()))
 
     def edit_jobs(self, dropped: Sequence[int]) -> list[Job]:
-        """Return the re-optimisation of the latest run without frames; nothing where all are back: it is as it was.
-
-        Args:
-            dropped: numbers of the frames to leave out.
-        """
+        """Return the re-optimisation of the latest run without frames; nothing where all are back: it is as it was."""
         run = self.runs()[-1]
         self._choose(dropped=tuple(sorted(dropped)))
         if not dropped:

@@ -107,11 +107,6 @@ class Viewers:
 def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
     """Serve the page on 127.0.0.1 until the user ends it; builds that run then make the model of the frames so far.
 
-    Args:
-        studio: what is shown.
-        port: where; 0: a free one.
-        announce: receives the address.
-
     Raises:
         InputError: if the port cannot be had.
     """

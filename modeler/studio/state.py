@@ -56,13 +56,7 @@ class Studio:
         return self._scans[folder]
 
     def watch(self, folder: Path, prior: str | None, step_deg: float | None) -> list[Job]:
-        """Build from a folder that a camera program writes, frame by frame, and show what comes.
-
-        Args:
-            folder: where it writes; it need not be there yet.
-            prior: name of the motion prior; None: auto.
-            step_deg: turn from frame to frame (turntable).
-        """
+        """Build from a folder that a camera program writes, frame by frame, and show what comes."""
         place, choices = self._chosen(folder)
         choices = replace(choices, prior=prior, step_deg=step_deg, dropped=())
         place.mkdir(parents=True, exist_ok=True)
@@ -77,11 +71,6 @@ class Studio:
 
     def record(self, camera: str, prior: str | None, step_deg: float | None) -> list[Job]:
         """Build from the views that a person takes with a connected camera.
-
-        Args:
-            camera: such as `realsense:`.
-            prior: name of the motion prior; None: auto.
-            step_deg: turn from view to view (turntable).
 
         Raises:
             InputError: if the camera cannot be had.

@@ -43,13 +43,7 @@ class Candidate:
         return PokePrior(poke=self.poke)
 
     def motion(self, last: RayImage, stand: Stand, object_from_last: Array) -> Array:
-        """Return new_from_last (4, 4), the expected motion of the object in the camera's coordinates.
-
-        Args:
-            last: the view before the action.
-            stand: pose of the object on its table.
-            object_from_last: (4, 4) of that view.
-        """
+        """Return new_from_last (4, 4), the expected motion of the object in the camera's coordinates."""
         if self.new_from_last is not None:
             return np.array(self.new_from_last, dtype=np.float64)
         if self.poke is not None:

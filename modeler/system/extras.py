@@ -17,11 +17,6 @@ def install_command(extra: str) -> str:
 def check_installed(module: str, package: str, extra: str) -> None:
     """Reject work that needs a package that is not installed.
 
-    Args:
-        module: by which the package is imported.
-        package: its name.
-        extra: which of ours installs it.
-
     Raises:
         InputError: if it is not installed.
     """

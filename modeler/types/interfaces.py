@@ -114,12 +114,9 @@ class AbstractPrior(ABC):
         """
 
     def relaxed(self, steps: float) -> AbstractPrior:
-        """Return the prior with limits for a motion of several steps; by default the prior itself.
+        """Return the prior with limits for a motion of several steps, at least 1; by default the prior itself.
 
         Used after lost frames, and if the motion seems to exceed the limits.
-
-        Args:
-            steps: number of steps, at least 1.
         """
         return self
 

@@ -259,11 +259,7 @@ def loops_closed(edges: Sequence[Edge]) -> int:
 
 
 def segments(edges: Sequence[Edge]) -> dict[int, int]:
-    """Return the number of its segment for each frame of edges: frames that are connected without joins are in one.
-
-    Args:
-        edges: those that take part.
-    """
+    """Return the number of its segment for each frame of edges that take part: frames connected without joins."""
     ends = _ends(edges)
     frames, indices = np.unique(ends, return_inverse=True)
     indices = indices.reshape(-1, 2)[np.array([edge.kind != "join" for edge in edges], dtype=bool)]

@@ -225,11 +225,6 @@ def render(
 ) -> None:
     """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`.
 
-    Args:
-        recipe: to render.
-        folder: where to write; it may exist if it is empty.
-        through: wrapper of the frames, such as a progress counter.
-
     Raises:
         InputError: if the folder is not empty or cannot be written.
     """

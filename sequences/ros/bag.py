@@ -181,10 +181,6 @@ class Bag:
     def messages(self, topic: str, most: int | None = None) -> Iterator[tuple[Stamp, Any]]:
         """Read the messages of a topic in the order in which they were received.
 
-        Args:
-            topic: one of `types`.
-            most: largest number of messages.
-
         Raises:
             InputError: if the bag is broken.
         """

@@ -45,12 +45,7 @@ def is_colour(message: Any) -> bool:
 
 
 def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]:
-    """Return depth (h, w) in m, NaN where nothing was measured.
-
-    Args:
-        message: an image for which `is_depth`.
-        unit_mm: unit of 16-bit depth.
-        where: the bag and the topic, for error messages.
+    """Return depth (h, w) in m, NaN where nothing was measured, of an image for which `is_depth`.
 
     Raises:
         InputError: if the message contradicts itself.

@@ -22,13 +22,7 @@ MOST = 1000
 
 
 def static_transform(bag: Bag, target: str, source: str) -> Array | None:
-    """Return target_from_source (4, 4), in m, between two frames; None if no fixed transforms lead there.
-
-    Args:
-        bag: with a topic `tf_static`.
-        target: `frame_id` of one image.
-        source: `frame_id` of another.
-    """
+    """Return target_from_source (4, 4), in m, between two frames; None if no fixed transforms lead there."""
     if not target or not source:
         return None
     steps: dict[str, list[tuple[str, Array]]] = {}

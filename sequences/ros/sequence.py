@@ -107,12 +107,6 @@ def colour_source(
 ) -> tuple[ColourSource | None, list[str]]:
     """Return the source of colour that is or can be aligned to depth, and a note on other colour.
 
-    Args:
-        bag: the bag.
-        first: the first image of each topic.
-        depth: topic and camera of the depth images.
-        overrides: values that take precedence over the bag.
-
     Raises:
         InputError: if the topic asked for holds none.
     """

@@ -72,12 +72,7 @@ def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Arr
 
 
 def mask_cards(result: Result, pictures: Mapping[int, Thumbnails]) -> Sequence[str]:
-    """Return every frame with its mask as HTML, nothing where there are no pictures.
-
-    Args:
-        result: the run.
-        pictures: by frame number.
-    """
+    """Return every frame with its mask as HTML, nothing where there are no pictures."""
     parts, contradicted = [], result.report.get("contradicted") or {}
     for frame in result.report["frames"]:
         shown = pictures.get(frame["id"])
@@ -237,12 +232,7 @@ class Marks:
 
 
 def thumbnails(rows: Mapping[str, Mapping[int, Row]], report: Mapping[str, Any]) -> dict[int, Thumbnails]:
-    """Return the pictures by frame number.
-
-    Args:
-        rows: of the recording, as `recorded` returns them.
-        report: `report.json`.
-    """
+    """Return the pictures by frame number."""
     frames = sorted({frame for entity in rows.values() for frame in entity})
     marks = {int(frame): Marks.read(found) for frame, found in (report.get("contradicted") or {}).items()}
     doubtful = {record["id"] for record in report["frames"] if record.get("mask") == Outcome.UNSURE_MASK.label}
@@ -297,14 +287,7 @@ def _picture(row: Row) -> Image.Image | None:
 def _outlined(
     picture: Image.Image | None, mask: Image.Image | None, size: tuple[int, int], marks: Marks | None = None
 ) -> bytes | None:
-    """Return the part of a picture (colour or depth) around the object, outlined; None without a picture.
-
-    Args:
-        picture: of the frame.
-        mask: of the object.
-        size: height and width in px; the height follows the part.
-        marks: surface to mark.
-    """
+    """Return the part of a picture (colour or depth) around the object, outlined; None without a picture."""
     if picture is None:
         return None
     mask = Image.new("L", picture.size, 255) if mask is None else mask.convert("L").resize(picture.size)

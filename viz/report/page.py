@@ -297,25 +297,13 @@ def asset(name: str) -> str:
 
 
 def figure(picture: bytes, caption: str, *, style: str = "", kind: str = "svg+xml") -> str:
-    """Return a picture with a caption.
-
-    Args:
-        picture: the file's bytes.
-        caption: in HTML.
-        style: the picture's class.
-        kind: its media type, after `image/`.
-    """
+    """Return a picture, of media type `image/` and `kind`, with a caption in HTML."""
     image = f"<img class='{style}' src='{data_address(picture, kind)}' alt=''>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
 def symmetry_section(path: Path, report: Mapping[str, Any]) -> Sequence[str]:
-    """Return the symmetries of the mesh in a file as HTML; nothing where it has none that can be drawn.
-
-    Args:
-        path: of the mesh, in the object frame.
-        report: `report.json`.
-    """
+    """Return the symmetries of the mesh in a file as HTML; nothing where it has none that can be drawn."""
     try:
         model = read_model(path)
     except InputError:
@@ -332,12 +320,7 @@ def symmetry_section(path: Path, report: Mapping[str, Any]) -> Sequence[str]:
 
 
 def rotation_words(found: Symmetries, up: Array) -> str:
-    """Return the rotations in words, those about one axis together.
-
-    Args:
-        found: the symmetries.
-        up: (3,) unit, the vertical.
-    """
+    """Return the rotations in words, those about one axis together; `up` (3,) is the vertical."""
     if len(found.continuous) > 1:
         return "every rotation about its centre"
     said = [f"any angle about {_axis_words(axis.direction, up)}" for axis in found.continuous]
@@ -468,11 +451,7 @@ CHECKS: Final = {
 
 
 def evidence_table(evidence: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the values with their limits as HTML; "" for runs of earlier versions.
-
-    Args:
-        evidence: as in `report.json`.
-    """
+    """Return the values with their limits as HTML; "" for runs of earlier versions."""
     rows = [_row(CHECKS.get(name, Check(name.replace("_", " "), "")), figure) for name, figure in evidence.items()]
     if not rows:
         return ""

@@ -37,12 +37,7 @@ _CIRCLE: Final = np.stack([np.cos(np.linspace(0, 2 * np.pi, 49)), np.sin(np.lins
 
 
 def trajectory(result: Result, shape_m: Array) -> bytes:
-    """Draw the cameras around the object from above and from the side, with 3 sd ellipses of their positions.
-
-    Args:
-        result: the run.
-        shape_m: (n, 3) points of the object, in the object frame.
-    """
+    """Draw the cameras around points (n, 3) of the object from above and from the side, with 3 sd ellipses."""
     figure = new_figure(9.0, 4.6)
     centres = np.array([pose.mean[:3, 3] for pose in result.poses.values()])
     middle = centres.mean(axis=0)
@@ -82,12 +77,7 @@ def _cameras(axis: Axes, result: Result, axes: Array, middle: Array) -> None:
 
 
 def uncertainty(result: Result, centre_m: Array) -> bytes:
-    """Draw the sd of every edge, and of every pose before closure and after, with errors where the truth is known.
-
-    Args:
-        result: the run.
-        centre_m: (3,) the object's centre, in the object frame.
-    """
+    """Draw the sd of every edge, and of every pose before closure and after, with errors where the truth is known."""
     figure = new_figure(9.0, 4.0)
     of_rotation, of_translation = figure.subplots(1, 2)
     for label, poses, colour in (("before closure", result.chain, BEFORE), ("after optimisation", result.poses, AFTER)):
@@ -114,12 +104,7 @@ def uncertainty(result: Result, centre_m: Array) -> bytes:
 
 
 def errors(result: Result, centre_m: Array) -> bytes:
-    """Draw the error of every pose, before and after closure, with the limit that it keeps with 95 % probability.
-
-    Args:
-        result: with the truth of at least its first frame.
-        centre_m: (3,) the object's centre, in the object frame.
-    """
+    """Draw the error of every pose, before and after closure, with the limit that it keeps with 95 % probability."""
     figure = new_figure(9.0, 3.8)
     of_rotation, of_translation = figure.subplots(1, 2)
     for label, poses, colour in (("before closure", result.chain, BEFORE), ("after optimisation", result.poses, AFTER)):

@@ -125,11 +125,7 @@ def cloud(row: Row) -> tuple[Array, npt.NDArray[np.uint8]] | None:
 
 
 def surfaces(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Array]:
-    """Return the surface points (n, 3) of each frame that was registered, or registered to, in its own camera's frame.
-
-    Args:
-        rows: as `recorded` returns them.
-    """
+    """Return the surface points (n, 3) of frames that were registered, or registered to, in their cameras' frames."""
     found = {frame: cloud(row) for frame, row in rows[entities.PAIR_BEFORE].items()}
     for frame, caption in rows[entities.PAIR_CAPTION].items():
         pair, target = registered(caption), rows[entities.PAIR_TARGET].get(frame)
