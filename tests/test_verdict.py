@@ -1,6 +1,6 @@
 """The verdict on a model: every check speaks against wrong models, and not against right ones."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +10,7 @@ from run_builders import ball
 from scipy.special import ndtr
 
 from modeler import se3
+from modeler.fusion import SymmetryFinder
 from modeler.graph import PoseGraph, solve
 from modeler.priors import AutoPrior, GeneralPrior, HeldPrior, ProductPrior, TablePrior, TurntablePrior
 from modeler.priors.mixtures import Gaussian
@@ -27,7 +28,6 @@ from modeler.types import (
     HandPoses,
     LowOverlap,
     Mode,
-    ObjectModel,
     OpenRotation,
     Outcome,
     Plane,
@@ -415,7 +415,6 @@ def whole_run(
     depth_scale_sigma: float = 0.0,
     focal: FocalLength | None = None,
     spin_rad: float = 0.0,
-    free_turns: Callable[[ObjectModel], Array] | None = None,
 ) -> tuple[list[str], dict[str, bool]]:
     """Codes of what is wrong with a run whose poses are true, and which figures hold."""
     views, poses = views_of(angles_deg), poses_of(angles_deg)
@@ -450,7 +449,6 @@ def whole_run(
         closure_expected=expected,
         depth_scale_sigma=depth_scale_sigma,
         tolerance_m=0.005,
-        free_turns=free_turns,
     )
     assert verdict.trustworthy == (not verdict.reasons)
     return list(verdict.codes), {name: check.holds for name, check in verdict.checks.items()}
@@ -474,14 +472,13 @@ def test_poses_that_hang_on_the_focal_length_are_not_to_be_trusted(sigma: float,
         (np.array([[1.0, 0.0, 0.0, 0.0, 0.6, 0.0]]), ["unsure_rotation", "unsure_place"]),  # about another axis
     ],
 )
-def test_how_far_a_body_of_revolution_turned_is_no_matter_of_its_model(turns: Array, codes: list[str]) -> None:
-    found, _ = whole_run(
-        STEPS_DEG, spin_rad=0.1, refused=OpenRotation(9.0), expected=True, free_turns=lambda model: turns
-    )
+def test_how_far_a_body_of_revolution_turned_is_no_matter_of_its_model(
+    turns: Array, codes: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SymmetryFinder, "free_turns", lambda finder, model: turns)
+    found, _ = whole_run(STEPS_DEG, spin_rad=0.1, refused=OpenRotation(9.0), expected=True)
     assert found == codes
-    elsewhere, _ = whole_run(
-        STEPS_DEG, spin_rad=0.1, refused=LowOverlap(0.3, 0.4), expected=True, free_turns=lambda model: turns
-    )
+    elsewhere, _ = whole_run(STEPS_DEG, spin_rad=0.1, refused=LowOverlap(0.3, 0.4), expected=True)
     assert elsewhere == ["closures_refused", "unsure_rotation", "unsure_place"]
 
 

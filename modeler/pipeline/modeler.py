@@ -8,7 +8,7 @@ from functools import partial
 from typing import TypeVar, final
 
 from modeler.closure import Closer, Placement
-from modeler.fusion import Fuser, Preview, SymmetryFinder, conditional_covariances, widened
+from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import MovingGraph, estimate_focal_length, shared_noise, variance_factor
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment
@@ -338,7 +338,6 @@ class Run:
             depth_scale_sigma=self.depth_scale_sigma,
             tolerance_m=self.modeler.tolerance_m,
             colour=self.modeler.colour,
-            free_turns=SymmetryFinder().free_turns,
         )
         yield replace(last, verdict=verdict)
 

@@ -117,4 +117,5 @@ def _expectations(run: Reopened, meta: RunMeta) -> dict[str, Any]:
         "prior": parts.prior,
         "closure_expected": comes_back(part.sequence, parts.prior, parts.closer.max_angle_deg),
         "tolerance_m": None if tolerance_mm is None else 1e-3 * tolerance_mm,
+        "colour": parts.colour,
     }

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from modeler import se3
+from modeler.fusion import SymmetryFinder
 from modeler.types import (
     ACCEPTED,
     AWAY_DEG,
     NEAR_DEG,
     AbstractPrior,
-    Array,
     Check,
     Edge,
     Failed,
     FocalLength,
     FrameRecord,
     LowOverlap,
-    ObjectModel,
     OpenRotation,
     OptimisationOutlier,
     Outcome,
@@ -72,7 +71,6 @@ def judged(
     depth_scale_sigma: float = 0.0,
     tolerance_m: float | None = None,
     colour: bool = True,
-    free_turns: Callable[[ObjectModel], Array] | None = None,
 ) -> Verdict:
     """Judge the model of a run. Evidence is gathered after the last step, when all edges are in.
 
@@ -84,9 +82,6 @@ def judged(
         depth_scale_sigma: standard deviation of the depth scale's logarithm, as the camera was given; 0 = exact.
         tolerance_m: error of the surface above which a model is wrong; None: `default_tolerance_m`.
         colour: whether colour is to fit depth.
-        free_turns: returns ξ (k, 6) of turns by 1 rad in the object frame under which a model stays as it is: about
-            the axis of a body of revolution, or three axes of a ball. How far it turned so is no matter of its surface.
-            None: it is not asked.
     """
     reasons, frames = [], step.frames_so_far
     if tolerance_m is None:
@@ -109,8 +104,9 @@ def judged(
     if step.last:
         about_mean = AboutMean.of(step.solution)
         spreads = _spreads(step, edges, tolerance_m, about_mean)
-        model = step.model if free_turns is not None and _only_turns_are_open(spreads, open_loop, step) else None
-        if free_turns is not None and model is not None and len(turns := free_turns(model)):
+        model = step.model if _only_turns_are_open(spreads, open_loop, step) else None
+        # How far a body of revolution turned about its axis, or a ball in any way, is no matter of its surface.
+        if model is not None and len(turns := SymmetryFinder().free_turns(model)):
             spreads = _spreads(step, edges, tolerance_m, about_mean.but_for(turns, step.solution.trajectory))
             open_loop = []
         spreads += _size(step, depth_scale_sigma, tolerance_m)
