@@ -5,18 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from modeler import se3
 from modeler.composition.compose import comes_back
-from modeler.export import RunFolder, RunMeta, locked
+from modeler.export import RunFolder, RunMeta
 from modeler.graph import PoseGraph, solve
-from modeler.runs.joining import write_run
+from modeler.runs.joining import Work, sequences_of, write_run
 from modeler.runs.reopening import Reopened, reopened
 from modeler.types import Edge, InputError, Verdict
-from modeler.verdict import judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,30 +60,21 @@ def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> 
     unconnected = tuple(sorted(rest.keys() - joined))
     edges = tuple(edge for edge in before.edges if {edge.source, edge.target} <= joined)
     first = min(joined)
-    graph, first_from_object = (
-        PoseGraph(edges, first),
-        se3.inverse(rest[first]),
-    )  # the first camera's is the object's frame
+    graph, first_from_object = PoseGraph(edges, first), se3.inverse(rest[first])  # the first camera's is the object's
     solution = solve(graph, {frame: first_from_object @ rest[frame] for frame in sorted(joined)})
     part = _without(before, {*dropped, *unconnected})
     report, settings = before.report, dict(before.report["settings"])
     made = RunFolder(out)
-    for name in ("sensor", "camera"):
-        if name in settings:
-            settings[name] = made.stored(RunFolder(run).located(settings[name]))
+    for name in {"sensor", "camera", "continues"} & settings.keys():
+        settings[name] = made.stored(RunFolder(run).located(settings[name]))
     if "joined" in settings:
         settings["joined"] = [made.stored(RunFolder(run).located(part)) for part in settings["joined"]]
-    if "continues" in settings:
-        settings["continues"] = made.stored(RunFolder(run).located(settings["continues"]))
     settings["dropped"] = sorted({*settings.get("dropped", ()), *dropped, *unconnected})
-    sequences = [made.stored(RunFolder(run).located(one)) for one in report["sequence"].split(" + ")]
-    meta = RunMeta(" + ".join(sequences), report["seed"], report["prior"], settings, report.get("camera"))
-    judge = partial(judged, **_expectations(before, meta))
-    same = out.resolve() == run.resolve()
-    with locked(out):
-        folder = RunFolder.open(out, overwrite=overwrite and not same, resume=same)
-        found, verdict = write_run(folder, (part,), graph, solution, meta, shown=edges, judge=judge, began_s=began_s)
-        folder.finish()
+    sequence = " + ".join(sequences_of(run, before, out))
+    meta = RunMeta(sequence, report["seed"], report["prior"], settings, report.get("camera"))
+    same, work = out.resolve() == run.resolve(), Work((part,), graph, solution, edges, began_s)
+    expected = _expected(before, settings.get("tolerance_mm"))
+    found, verdict = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **expected)
     return Edited(found, verdict, unconnected)
 
 
@@ -105,15 +94,13 @@ def _without(run: Reopened, frames: Collection[int]) -> Reopened:
     return replace(run, report=report, views={k: view for k, view in run.views.items() if k not in frames})
 
 
-def _expectations(run: Reopened, meta: RunMeta) -> dict[str, Any]:
-    """Return what the verdict on a run depends on besides its last step."""
-    sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
+def _expected(run: Reopened, tolerance_mm: float | None) -> dict[str, Any]:
+    """Return what the verdict on a run depends on besides its last step and its camera."""
     part, *others = run.parts
     if others:
-        return {"depth_scale_sigma": sigma}
-    parts, tolerance_mm = part.modeler(), meta.settings.get("tolerance_mm")
+        return {}
+    parts = part.modeler()
     return {
-        "depth_scale_sigma": sigma,
         "prior": parts.prior,
         "closure_expected": comes_back(part.sequence, parts.prior, parts.closer.max_angle_deg),
         "tolerance_m": None if tolerance_mm is None else 1e-3 * tolerance_mm,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -13,12 +12,12 @@ import numpy as np
 
 from modeler import se3
 from modeler.composition.options import ObjectOptions
-from modeler.export import RunFolder, RunMeta, locked
+from modeler.export import RunFolder, RunMeta
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline.joining import Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
-from modeler.runs.joining import later_s, write_run
+from modeler.runs.joining import Work, later_s, sequences_of, write_run
 from modeler.runs.known_objects import is_of_camera, known_object
 from modeler.runs.reopening import Part, Reopened, reopened
 from modeler.sequences import AbstractSequence, Overrides
@@ -36,7 +35,6 @@ from modeler.types import (
     Verdict,
     explain,
 )
-from modeler.verdict import judged
 
 _PARTNERS: Final = 3  # views of the model that a new one is registered with: two that agree, and one that may fail
 _WHY: Final = Stated("it agrees with the place of the frame on the model")
@@ -114,10 +112,7 @@ class Growth:
         views_kept = {k: view for k, view in new.items() if k in kept}
         second = replace(before, name=frames.name, report={"frames": records}, views=views_kept, parts=(part,))
         meta = RunMeta(
-            sequence=" + ".join(
-                [*(made.stored(RunFolder(run).located(one)) for one in before.report["sequence"].split(" + ")),
-                 made.stored(path)]
-            ),
+            sequence=" + ".join([*sequences_of(run, before, out), made.stored(path)]),
             seed=self.seed,
             prior="none",
             settings={"continues": made.stored(run), "offset": offset, "later_s": part.later_s,
@@ -126,22 +121,9 @@ class Growth:
         )  # fmt: skip
         graph = PoseGraph(edges=edges, first=min(poses))
         solution = solve(graph, {k: pose for k, pose in {**poses, **placed}.items() if k in kept})
-        with locked(out):
-            folder = RunFolder.open(out, overwrite=overwrite)
-            sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
-            shown = [edge for edge in edges if edge.source in views_kept and edge.target in before.views]
-            found_report, verdict = write_run(
-                folder,
-                (before, second),
-                graph,
-                solution,
-                meta,
-                shown=shown,
-                judge=partial(judged, depth_scale_sigma=sigma),
-                began_s=began_s,
-            )
-            folder.finish()
-        return Grown(found_report, verdict, len(views_kept), len(frames.indices))
+        shown = [edge for edge in edges if edge.source in views_kept and edge.target in before.views]
+        work = Work((before, second), graph, solution, shown, began_s)
+        return Grown(*write_run(out, work, meta, overwrite=overwrite), len(views_kept), len(frames.indices))
 
     def _placed(self, model: ObjectModel, part: Part, views: Sequence[RayImage]) -> list[Tracked]:
         """Return the model in views of the recording, followed from each to the next."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,13 +70,8 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
         frame: alignments[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()
     }
     made = RunFolder(out)
-    sequences = [
-        made.stored(RunFolder(run).located(part))
-        for run, opened in ((run_a, first), (run_b, second))
-        for part in opened.report["sequence"].split(" + ")
-    ]
     meta = RunMeta(
-        sequence=" + ".join(sequences),
+        sequence=" + ".join([*sequences_of(run_a, first, out), *sequences_of(run_b, second, out)]),
         seed=seed,
         prior="none",
         settings={
@@ -87,16 +82,15 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
         },
         camera=_least_known([*first.parts, *second.parts]),
     )
-    with locked(out):
-        folder = RunFolder.open(out, overwrite=overwrite)
-        sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
-        judge = partial(judged, depth_scale_sigma=sigma)
-        shown = [edge for edge in graph.edges if edge.source in second.views and edge.target in first.views]
-        report, verdict = write_run(
-            folder, (first, second), graph, solve(graph, guess), meta, shown=shown, judge=judge, began_s=began_s
-        )
-        folder.finish()
-    return Joined(alignments, report, verdict)
+    shown = [edge for edge in graph.edges if edge.source in second.views and edge.target in first.views]
+    work = Work((first, second), graph, solve(graph, guess), shown, began_s)
+    return Joined(alignments, *write_run(out, work, meta, overwrite=overwrite))
+
+
+def sequences_of(run: Path, opened: Reopened, out: Path) -> list[str]:
+    """Return the sequences of a run as the report of another one has them."""
+    parts = opened.report["sequence"].split(" + ")
+    return [RunFolder(out).stored(RunFolder(run).located(part)) for part in parts]
 
 
 def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
@@ -143,63 +137,76 @@ def _shifted(run: Reopened, offset: int, later_s: float) -> Reopened:
     return replace(run, report=report, views=views, edges=edges, solution=solution)
 
 
+@dataclass(frozen=True, eq=False)
+class Work:
+    """A graph of finished runs that was solved anew."""
+
+    parts: Sequence[Reopened]
+    """The runs, whose frames have different numbers."""
+    graph: PoseGraph
+    """Of all their frames."""
+    solution: Solution
+    """Its poses."""
+    shown: Sequence[Edge]
+    """Edges whose best is drawn as the newest pair."""
+    began_s: float
+    """When the work began, by `time.perf_counter`."""
+
+
 def write_run(
-    folder: RunFolder,
-    parts: Sequence[Reopened],
-    graph: PoseGraph,
-    solution: Solution,
-    meta: RunMeta,
-    *,
-    shown: Sequence[Edge],
-    judge: Callable[[Step], Verdict],
-    began_s: float,
+    out: Path, work: Work, meta: RunMeta, *, overwrite: bool = False, resume: bool = False, **expected: Any
 ) -> tuple[Mapping[str, Any], Verdict]:
-    """Fuse the frames of finished runs anew, write a run folder with its recording, and return report and verdict.
+    """Fuse frames anew, write a run folder with its recording, and return report and verdict.
 
     Args:
-        folder: to write to.
-        parts: the runs, whose frames have different numbers.
-        graph: of all their frames.
-        solution: its poses.
+        out: where.
+        work: what is fused.
         meta: contents of the report besides the results.
-        shown: edges whose best is drawn as the newest pair.
-        judge: returns the verdict on the last step.
-        began_s: when the work began, by `time.perf_counter`.
+        overwrite: replace another run there.
+        resume: replace the files of the run there one by one.
+        expected: arguments of `judged` besides the step and the uncertainty of the depth scale.
     """
-    views = {frame: view for part in parts for frame, view in part.views.items()}
-    model = Fuser(voxel_m=meta.settings.get("voxel_m")).fuse(
-        views, solution.trajectory, conditional_covariances(solution, graph.edges)
-    )
+    with locked(out):
+        folder = RunFolder.open(out, overwrite=overwrite, resume=resume)
+        step = _last_step(work, meta.settings.get("voxel_m"))
+        sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
+        verdict = judged(step, depth_scale_sigma=sigma, **expected)
+        step = replace(step, verdict=verdict)
+        facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
+        name = " + ".join(part.name for part in work.parts)
+        with closing(open_stream(name, save=out / "recording.rrd", facts=facts)) as stream:
+            report = folder.write(step, replace(meta, seconds={"total": time.perf_counter() - work.began_s}))
+            first = min(step.views)
+            root = {first: np.eye(4)}
+            view = step.views[first]
+            stream(_step(view, solution=Solution(root, odometry=root), views={first: view}))
+            stream(step)
+        folder.finish()
+    return report, verdict
+
+
+def _last_step(work: Work, voxel_m: float | None) -> Step:
+    """Return the last step of a run that would have given a graph."""
+    solution, edges = work.solution, work.graph.edges
+    views = {frame: view for part in work.parts for frame, view in part.views.items()}
+    model = Fuser(voxel_m=voxel_m).fuse(views, solution.trajectory, conditional_covariances(solution, edges))
     model = widened(model, solution)
     names = [field.name for field in fields(FrameRecord)]
     records = [
         FrameRecord(**{name: record[name] for name in names if name in record})
-        for part in parts
+        for part in work.parts
         for record in part.report["frames"]
     ]
-    best = max((edge.posterior for edge in shown if edge.accepted), key=lambda posterior: posterior.overlap)
-    first, root = min(views), {min(views): np.eye(4)}
-    begun = _step(views[first], solution=Solution(root, odometry=root), views={first: views[first]})
-    step = replace(
+    best = max((edge.posterior for edge in work.shown if edge.accepted), key=lambda posterior: posterior.overlap)
+    return replace(
         _step(views[best.source], solution=solution, views=views),
         posteriors=(best,),
-        edges=tuple(shown),
+        edges=tuple(work.shown),
         make_model=lambda: model,
-        edges_so_far=graph.edges,
+        edges_so_far=edges,
         frames_so_far=tuple(sorted(records, key=lambda record: record.id)),
         last=True,
     )
-    verdict = judge(step)
-    step = replace(step, verdict=verdict)
-    facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
-    stream = open_stream(" + ".join(part.name for part in parts), save=folder.path / "recording.rrd", facts=facts)
-    try:
-        report = folder.write(step, replace(meta, seconds={"total": time.perf_counter() - began_s}))
-        stream(begun)
-        stream(step)
-    finally:
-        stream.close()
-    return report, verdict
 
 
 def _step(view: RayImage, *, solution: Solution, views: Mapping[int, RayImage]) -> Step:
