@@ -349,7 +349,7 @@ def test_who_works_on_a_sequence_is_waited_for(tmp_path: Path) -> None:
     job = Job("s", str(sequence(tmp_path / "s", pairs=5, pause_s=0.1)), str(tmp_path / "out"))
     with ThreadPoolExecutor() as threads, jobs.PROCESSES.ended():
         ends = [future.result() for future in [threads.submit(jobs.run, job) for _ in range(2)]]
-    assert sorted(end is not None and end.fresh for end in ends) == [False, True]
+    assert [end is not None and end.status for end in ends] == [0, 0]
     assert book(tmp_path / "out") == [("s", pair) for pair in range(5)]
 
 

@@ -85,8 +85,6 @@ class Ended:
     """Its error line, if it failed."""
     tries: int = 0
     """How often it has failed."""
-    fresh: bool = True
-    """Whether it was built now, and not before."""
 
 
 def files_of(sequence: Path) -> list[Path]:
@@ -263,7 +261,7 @@ def run(job: Job) -> Ended | None:
         fcntl.flock(log, fcntl.LOCK_EX)  # shared by the process that builds, also where this one dies before it
         now = standing(job)
         if now in ("done", "failed"):
-            return ended(job.name, read_note(job.note), fresh=False)
+            return ended(job.name, read_note(job.note))
         for left in job.note.parent.glob(f".{glob.escape(job.note.name)}.*.part"):  # by a kill
             left.unlink(missing_ok=True)
         log.truncate(0)
@@ -291,9 +289,9 @@ def write_failure(job: Job, line: str, status: int = 2) -> Ended:
     return ended(job.name, read_note(job.note))
 
 
-def ended(name: str, note: dict[str, Any], *, fresh: bool = True) -> Ended:
+def ended(name: str, note: dict[str, Any]) -> Ended:
     """Return how a job ended, from its state."""
-    return Ended(name, int(note.get("status", 2)), str(note.get("line", "")), int(note.get("tries", 0)), fresh)
+    return Ended(name, int(note.get("status", 2)), str(note.get("line", "")), int(note.get("tries", 0)))
 
 
 def last_line(log: Path, status: int) -> str:

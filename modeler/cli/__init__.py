@@ -22,7 +22,7 @@ from difflib import get_close_matches
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
@@ -45,47 +45,21 @@ from modeler.cli.suggest import Suggest
 from modeler.cli.track import Track
 from modeler.system.processes import check_room, share_one_heap
 
-Command = (
-    Build
-    | Batch
-    | Info
-    | Convert
-    | CalibrateSensor
-    | CalibrateCamera
-    | Register
-    | Evaluate
-    | Render
-    | View
-    | Report
-    | Export
-    | Track
-    | Join
-    | Edit
-    | Suggest
-    | Gallery
-    | Studio
-)
 
-COMMANDS: dict[str, type[Command]] = {
-    "build": Build,
-    "batch": Batch,
-    "info": Info,
-    "convert": Convert,
-    "calibrate-sensor": CalibrateSensor,
-    "calibrate-camera": CalibrateCamera,
-    "register": Register,
-    "evaluate": Evaluate,
-    "render": Render,
-    "view": View,
-    "report": Report,
-    "export": Export,
-    "track": Track,
-    "join": Join,
-    "edit": Edit,
-    "suggest": Suggest,
-    "gallery": Gallery,
-    "studio": Studio,
-}
+class Command(Protocol):
+    """A frozen dataclass of options."""
+
+    def run(self) -> int:
+        """Return the exit status."""
+        ...
+
+
+_ALL: tuple[type[Command], ...] = (
+    *(Build, Batch, Info, Convert, CalibrateSensor, CalibrateCamera, Register, Evaluate, Render, View, Report),
+    *(Export, Track, Join, Edit, Suggest, Gallery, Studio),
+)
+COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
+"""By name, in the order in which help lists them."""
 _STYLE = (
     tyro.conf.OmitSubcommandPrefixes,
     tyro.conf.OmitArgPrefixes,
@@ -201,13 +175,10 @@ def parsed(arguments: Sequence[str]) -> Command:
 def _overview() -> Any:
     """Return the type that is any of the commands, each described by its first sentence."""
     commands = COMMANDS.items()
+    told = {name: (command.__doc__ or "").split("\n\n", maxsplit=1)[0] for name, command in commands}
     return Union[  # noqa: UP007
-        tuple(Annotated[c, tyro.conf.subcommand(name, description=_first_sentence(c))] for name, c in commands)
+        tuple(Annotated[c, tyro.conf.subcommand(name, description=told[name])] for name, c in commands)
     ]
-
-
-def _first_sentence(command: type[Command]) -> str:
-    return (command.__doc__ or "").split("\n\n", maxsplit=1)[0]
 
 
 def _one_line(box: str) -> str:

@@ -95,7 +95,7 @@ class Batch:
                 )
             if changed:
                 say(f"the input of {_some(changed)} has changed since: only pairs that are new are registered")
-            ends = [ended(job.name, read_note(job.note), fresh=False) for job in jobs if stands[job] in _OVER]
+            ends = [ended(job.name, read_note(job.note)) for job in jobs if stands[job] in _OVER]
             waiting = [job for job in jobs if stands[job] not in _OVER]
             stand = Counter(stands.values())
             words = f"{stand['done']} done, {stand['failed']} failed twice, {stand['interrupted']} to be resumed"

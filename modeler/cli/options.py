@@ -74,18 +74,11 @@ def as_arguments(options: object) -> tuple[str, ...]:
         value = getattr(options, one.name)
         if value == one.default:
             continue
-        words.append(_flag(one.name if value is not False else f"no_{one.name}"))
+        words.append(f"--{'no-' if value is False else ''}{one.name.replace('_', '-')}")
         if not isinstance(value, bool):
-            words += [str(part.absolute() if isinstance(part, Path) else part) for part in _parts(value)]
+            parts = value if isinstance(value, tuple) else (value,)
+            words += [str(part.absolute() if isinstance(part, Path) else part) for part in parts]
     return tuple(words)
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-def _parts(value: object) -> tuple[object, ...]:
-    return value if isinstance(value, tuple) else (value,)
 
 
 @dataclass(frozen=True)

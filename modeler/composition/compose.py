@@ -198,7 +198,7 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
     for other in found[1:]:
         result = ProductPrior(result, other)
     for guess in (part for part in parts if part in _GUESSES):
-        result = _guess(guess, of[guess], result)
+        result = VelocityPrior(result, **of[guess]) if guess == "velocity" else FeaturesPrior(result)
     return result
 
 
@@ -338,11 +338,6 @@ def _literal(value: object) -> bool:
         return bool(ast.literal_eval(repr(value)) == value)
     except (ValueError, SyntaxError):
         return False
-
-
-def _guess(name: str, given: dict[str, Any], known: AbstractPrior) -> AbstractPrior:
-    """Return a proposal within a known prior."""
-    return VelocityPrior(known, **given) if name == "velocity" else FeaturesPrior(known)
 
 
 def _turntable(given: dict[str, Any], motion: Mapping[str, object], indices: Sequence[int]) -> TurntablePrior:

@@ -176,8 +176,6 @@ def enclosed_m3(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> float:
 
 def finite(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values with None for numbers that are not finite, as JSON and tables have it."""
-    return {name: None if _odd(value) else value for name, value in values.items()}
-
-
-def _odd(value: object) -> bool:
-    return isinstance(value, float) and not math.isfinite(value)
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
+    }

@@ -6,7 +6,7 @@ import math
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from importlib import metadata
 from typing import Any
 
@@ -33,12 +33,10 @@ from modeler.verdict.spreads import total_depth_scale_sigma
 
 _SCHEMA = 2
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
-_FREE_RAD = np.radians(
-    8.0
-)  # twice this is the usual step between views: the edge does not determine whether there was one
+_FREE_RAD = np.radians(8.0)  # twice this is the usual step between views: whether there was one, the edge does not say
 _FREE_M = 0.01  # surfaces of a hand-sized object are then visibly apart
+_OF_FRAME = tuple(entry.name for entry in fields(FrameRecord))  # `asdict` would take as long as all else
 _ALIKE = np.cos(np.radians(25.0))  # nearer than this, a direction goes by the name of another
-_OF_FRAME = tuple(entry.name for entry in fields(FrameRecord))
 _LONG = 1.5  # ratio of length to width above which an object has its own axis
 
 
@@ -48,12 +46,6 @@ def _versions() -> dict[str, str]:
         with suppress(metadata.PackageNotFoundError):  # modelling does without Open3D
             found[name] = metadata.version(name)
     return found
-
-
-def _no_advice(report: Mapping[str, Any]) -> Sequence[str]:
-    """Return no advice."""
-    del report
-    return ()
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,7 @@ class RunMeta:
     """Numbers of the frames that the scene was learned from."""
     versions: Mapping[str, str] = field(default_factory=_versions)
     """Version by package."""
-    advice: Callable[[Mapping[str, Any]], Sequence[str]] = _no_advice
+    advice: Callable[[Mapping[str, Any]], Sequence[str]] = lambda _: ()
     """From a report to what to do about a model that cannot be trusted, in words."""
 
 
@@ -101,7 +93,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         "scene_frames": list(meta.scene_frames),
         "digests": {str(index): digest for index, digest in meta.digests.items()},
         "complete": step.last and "interrupted" not in verdict.codes,
-        "closed": loops_closed(_taking_part(step)) > 0,
+        "closed": loops_closed([edge for edge in step.edges_so_far if solution.takes_part(edge)]) > 0,
         "loop": _loop(step.edges_so_far, solution, views),
         "camera": _camera(meta.camera, solution, views),
         "trustworthy": verdict.trustworthy,
@@ -109,15 +101,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         "trusted_to_m": verdict.trusted_to_m,
         "reasons": verdict.reasons,
         "reason_codes": verdict.codes,
-        "evidence": {
-            name: {
-                "value": check.value,
-                "limit": check.limit,
-                "at_least": check.at_least,
-                "holds": check.holds,
-            }
-            for name, check in verdict.checks.items()
-        },
+        "evidence": {name: {**asdict(check), "holds": check.holds} for name, check in verdict.checks.items()},
         "contradicted": {
             str(frame): {
                 "size": views[frame].frame.depth_m.shape,
@@ -184,10 +168,6 @@ def _support(solution: Solution, views: Mapping[int, RayImage]) -> Plane | None:
     """Return the support plane in the first frame, whose camera frame is the object's; None if not seen."""
     first = views.get(min(solution.trajectory, default=-1))
     return None if first is None else first.plane
-
-
-def _taking_part(step: Step) -> list[Edge]:
-    return [edge for edge in step.edges_so_far if step.solution.takes_part(edge)]
 
 
 def edge_record(

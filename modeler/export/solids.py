@@ -81,7 +81,7 @@ class ConvexParts:
     """How they were found, in words."""
 
 
-def convex_parts(model: ObjectModel, seed: int = 0) -> ConvexParts:
+def convex_parts(model: ObjectModel) -> ConvexParts:
     """Return convex parts of a closed mesh: by CoACD where it is installed, else one convex hull.
 
     CoACD: Wei et al. 2022, "Approximate convex decomposition for 3D meshes with collision-aware concavity and tree
@@ -95,7 +95,7 @@ def convex_parts(model: ObjectModel, seed: int = 0) -> ConvexParts:
     coacd.set_log_level("error")
     coarse = simplified(model, PART_TRIANGLES)
     found = coacd.run_coacd(
-        coacd.Mesh(coarse.vertices_m, coarse.triangles.astype(np.int32)), threshold=_CONCAVITY, seed=seed, **_SEARCH
+        coacd.Mesh(coarse.vertices_m, coarse.triangles.astype(np.int32)), threshold=_CONCAVITY, seed=0, **_SEARCH
     )
     parts = tuple(_hull(np.asarray(vertices, dtype=np.float64)) for vertices, _ in found)
     return ConvexParts(parts, f"{len(parts)} convex part{'s' if len(parts) != 1 else ''} by CoACD")

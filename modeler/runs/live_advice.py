@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from modeler.pipeline import Modeler
-    from modeler.suggestion import Belief, Suggestion, Suggestions
+    from modeler.suggestion import Belief, Suggestions
     from modeler.types import Step
 
 Receiver = Callable[["Step", "Belief", "Suggestions"], None]
@@ -53,14 +53,9 @@ def advising(modeler: Modeler, *receivers: Receiver) -> Iterator[Callable[[Step]
             future.result()
 
 
-def best_manual_action(found: Suggestions) -> Suggestion | None:
-    """Return the best action that needs no input to the run: a poke would need `prior` poke."""
-    return next((each for each in found.ranked if each.prediction.candidate.action in ("turn", "lay")), None)
-
-
 def summary_of(found: Suggestions) -> str:
-    """Return the next action in a few words."""
-    best = best_manual_action(found)
+    """Return the next action in a few words, of those that need no input to the run: a poke needs `prior` poke."""
+    best = next((each for each in found.ranked if each.prediction.candidate.action in ("turn", "lay")), None)
     if found.reached or best is None:
         return "nothing more to gain"
     return f"next: {best.words.split(':')[0]}"

@@ -15,6 +15,7 @@ from modeler.suggestion.surface_cells import Stand
 from modeler.types import Array, Plane, RayImage
 
 Action = Literal["turn", "poke", "lay", "pose"]
+_PUSH_M = 0.03  # by which a finger moves: enough to turn an object of 10 cm by 20° or more
 
 
 @final
@@ -61,14 +62,13 @@ def turns(step_deg: float, largest_deg: float) -> list[Candidate]:
     return [Candidate("turn", turn_deg=sign * k * step_deg) for k in counts for sign in (1.0, -1.0)]
 
 
-def pokes(last: RayImage, stand: Stand, object_from_last: Array, *, length_m: float = 0.03) -> list[Candidate]:
+def pokes(last: RayImage, stand: Stand, object_from_last: Array) -> list[Candidate]:
     """Return pushes along the table at the sides of the object that the camera sees, which turn it either way.
 
     Args:
         last: the view before the action, with its support plane.
         stand: pose of the object on its table.
         object_from_last: (4, 4) of that view.
-        length_m: how far the finger moves.
     """
     if last.plane is None:
         return []
@@ -84,8 +84,8 @@ def pokes(last: RayImage, stand: Stand, object_from_last: Array, *, length_m: fl
         for ahead in (-1.0, 1.0):
             direction = last_from_stand[:3, :3] @ (ahead * towards)
             point = se3.transform(last_from_stand, at_m[None])[0]
-            push = Poke(_triple(point), _triple(direction), length_m)
-            turn_rad = _turn_rad(poked(push, last, last.plane), last.plane)
+            push = Poke(_triple(point), _triple(direction), _PUSH_M)
+            turn_rad = float(se3.log(poked(push, last, last.plane))[:3] @ last.plane.normal)
             found.append(Candidate("poke", turn_deg=float(np.degrees(turn_rad)), poke=push))
     return found
 
@@ -102,10 +102,6 @@ def poked(poke: Poke, last: RayImage, plane: Plane) -> Array:
     centre = last.centroid_m
     turned = se3.moved(np.eye(4), np.append(turn[0] * plane.normal, np.zeros(3)), centre)
     return se3.translation(shift[0] @ axes) @ turned
-
-
-def _turn_rad(motion: Array, plane: Plane) -> float:
-    return float(se3.log(motion)[:3] @ plane.normal)
 
 
 def _laid(stand: Stand, object_from_last: Array) -> Array:
