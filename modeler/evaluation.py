@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import gammaincinv
 
 from modeler import se3
+from modeler.system.pictures import raycaster, tensor
 from modeler.types import Array, BoolArray, Frame, PoseGaussian
-
-if TYPE_CHECKING:
-    import open3d as o3d
 
 LEVELS = (0.5, 0.9, 0.95)
 """Nominal probabilities of the regions whose coverage is reported."""
@@ -228,9 +226,7 @@ class TrueSurface:
         Args:
             frames: with their true camera_from_model (4, 4). A frame without a mask shows nothing but the object.
         """
-        import open3d as o3d
-
-        scene = _scene(self.vertices_m, self.triangles)
+        scene = raycaster(self.vertices_m, self.triangles)
         seen = np.zeros(len(self.points_m), dtype=bool)
         for frame, camera_from_model in frames:
             camera, measured = frame.camera, np.isfinite(frame.depth_m)
@@ -245,7 +241,7 @@ class TrueSurface:
             centre_m = se3.inverse(camera_from_model)[:3, 3]
             directions = self.points_m[candidates] - centre_m
             rays = np.concatenate([np.broadcast_to(centre_m, directions.shape), directions], axis=1)
-            reached = scene.cast_rays(o3d.core.Tensor.from_numpy(rays.astype(np.float32)))["t_hit"].numpy()
+            reached = scene.cast_rays(tensor(rays))["t_hit"].numpy()
             seen[candidates[reached > _REACHED]] = True
         return seen
 
@@ -266,16 +262,14 @@ def surface_errors(
     Raises:
         ValueError: if the mesh has no area.
     """
-    import open3d as o3d
 
-    def far_m(points_m: Array, scene: o3d.t.geometry.RaycastingScene) -> Array:
-        queries = o3d.core.Tensor.from_numpy(points_m.astype(np.float32))
-        return scene.compute_distance(queries).numpy().astype(np.float64)
+    def far_m(points_m: Array, vertices_m: Array, triangles: npt.NDArray[np.int64]) -> Array:
+        return raycaster(vertices_m, triangles).compute_distance(tensor(points_m)).numpy().astype(np.float64)
 
     points_m = sample_surface(vertices_m, triangles, len(truth.points_m), rng)
     return SurfaceErrors(
-        to_truth_m=far_m(points_m, _scene(truth.vertices_m, truth.triangles)),
-        to_reconstruction_m=far_m(truth.points_m, _scene(vertices_m, triangles)),
+        to_truth_m=far_m(points_m, truth.vertices_m, truth.triangles),
+        to_reconstruction_m=far_m(truth.points_m, vertices_m, triangles),
     )
 
 
@@ -300,14 +294,3 @@ def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: i
     fold = along + across > 1.0  # the far half of the parallelogram folds back onto the triangle
     along, across = np.where(fold, 1.0 - along, along), np.where(fold, 1.0 - across, across)
     return a[chosen] + along * (b - a)[chosen] + across * (c - a)[chosen]
-
-
-def _scene(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> o3d.t.geometry.RaycastingScene:
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices_m, dtype=np.float32)),
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
-    )
-    return scene

@@ -18,6 +18,7 @@ from modeler import se3
 from modeler.export import solids
 from modeler.runs.checks import Checks, mesh_checks
 from modeler.sequences import open_sequence
+from modeler.system.pictures import encoded
 from modeler.types import Array, InputError, ObjectModel
 
 SIDES_M = np.array([0.06, 0.1, 0.2])
@@ -193,7 +194,7 @@ def test_usd_holds_a_rigid_body_in_metres(tmp_path: Path, coloured: bool) -> Non
     Usd, UsdGeom, UsdPhysics, UsdShade = (
         pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdPhysics", "UsdShade")
     )
-    from modeler.export.mesh import linear_rgb, png_bytes, textured
+    from modeler.export.mesh import linear_rgb, textured
     from modeler.export.usd import write_usd
 
     pose = se3.exp(np.array([0.3, -0.2, 0.5, 0.02, 0.01, 0.1]))
@@ -203,7 +204,7 @@ def test_usd_holds_a_rigid_body_in_metres(tmp_path: Path, coloured: bool) -> Non
     if coloured:
         model, texture = textured(model, lambda points, *_: np.full((len(points), 3), (200, 20, 90), np.uint8), 64)
         of.folder.mkdir()
-        of.texture.write_bytes(png_bytes(texture))
+        of.texture.write_bytes(encoded(texture.image, "PNG"))
     write_usd(of, model, texture, body, parts)
 
     stage = Usd.Stage.Open(str(of.usd))

@@ -30,9 +30,9 @@ def layout(first: RayImage | None, further: Sequence[rrb.Container] = ()) -> rrb
 def tracking_layout(first: RayImage | None) -> rrb.Blueprint:
     """Return the layout of an object that is tracked: the frame with its outline, and the model among the points."""
     words = rrb.TextDocumentView(origin=entities.TRACKED_WORDS, name="In words")
-    eye = _near(first, FROM_THE_SIDE, 4.2)
-    model = _spatial("Model in the frame's points", [f"{entities.TRACKED}/**"], eye, origin=entities.TRACKED)
-    return _bare(rrb.Horizontal(rrb.Vertical(_frame(first), words, row_shares=[3.0, 1.0]), model))
+    eye = near(first, FROM_THE_SIDE, 4.2)
+    model = spatial("Model in the frame's points", [f"{entities.TRACKED}/**"], eye, origin=entities.TRACKED)
+    return _bare(rrb.Horizontal(rrb.Vertical(framed(first), words, row_shares=[3.0, 1.0]), model))
 
 
 def _bare(contents: rrb.Container) -> rrb.Blueprint:
@@ -53,13 +53,13 @@ def _poses(first: RayImage | None) -> rrb.Container:
     contents += [entities.BEFORE_POSITION_3_SIGMA, entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA]
     contents += [entities.MAGNIFICATION]
     details = rrb.Vertical(
-        _frame(first), rrb.TextDocumentView(origin=entities.POSES, name="Every pose"), row_shares=[1.0, 1.7]
+        framed(first), rrb.TextDocumentView(origin=entities.POSES, name="Every pose"), row_shares=[1.0, 1.7]
     )
-    large = _spatial("Cameras around the object, before and after loop closure", contents, _far(first))
+    large = spatial("Cameras around the object, before and after loop closure", contents, _far(first))
     return rrb.Horizontal(large, details, column_shares=[2.1, 1.0], name="Poses and uncertainty")
 
 
-def _frame(first: RayImage | None) -> rrb.View:
+def framed(first: RayImage | None) -> rrb.View:
     """Return the camera's image, in colour unless the first frame has none, with the object outlined."""
     if first is None or first.frame.colour is not None:
         contents = [entities.COLOUR, entities.OUTLINE]
@@ -79,12 +79,12 @@ def _depth(first: RayImage | None) -> rrb.View:
 
 def _object(first: RayImage | None) -> rrb.Container:
     """Return the model, and the merged points before and after closure."""
-    near = _near(first, _ABOVE_LEFT, 3.4)
+    eye = near(first, _ABOVE_LEFT, 3.4)
     return rrb.Horizontal(
-        _spatial("Object model", [f"{entities.WORLD}/model/**"], near),
+        spatial("Object model", [f"{entities.WORLD}/model/**"], eye),
         rrb.Vertical(
-            _spatial("All points before loop closure", [entities.MERGED_BEFORE], near),
-            _spatial("All points after loop closure", [entities.MERGED_AFTER], near),
+            spatial("All points before loop closure", [entities.MERGED_BEFORE], eye),
+            spatial("All points after loop closure", [entities.MERGED_AFTER], eye),
         ),
         column_shares=[1.5, 1.0],
         name="Object",
@@ -93,7 +93,7 @@ def _object(first: RayImage | None) -> rrb.Container:
 
 def _pair(first: RayImage | None) -> rrb.Container:
     """Return the newest pair: depth, projection into the target view, both alignments, posterior and text."""
-    eye = _near(first, FROM_THE_SIDE, 4.2)
+    eye = near(first, FROM_THE_SIDE, 4.2)
     before = [entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_CAPTION]
     after = [entities.PAIR_TARGET, entities.PAIR_AFTER, entities.PAIR_AXES, entities.PAIR_DRAWS]
     ghosts = [entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS, entities.GHOST_LABELS]
@@ -105,10 +105,10 @@ def _pair(first: RayImage | None) -> rrb.Container:
         visual_bounds=None if first is None else around(first),
     )
     return rrb.Grid(
-        _spatial("Pair before alignment", before, eye, origin=entities.PAIR),
-        _spatial("Pair after alignment", after, eye, origin=entities.PAIR),
+        spatial("Pair before alignment", before, eye, origin=entities.PAIR),
+        spatial("Pair after alignment", after, eye, origin=entities.PAIR),
         _depth(first),
-        _spatial("Posterior, magnified", ghosts, eye, origin=entities.PAIR),
+        spatial("Posterior, magnified", ghosts, eye, origin=entities.PAIR),
         seen,
         rrb.TextDocumentView(origin=entities.NOW, name="In words"),
         grid_columns=3,
@@ -121,7 +121,7 @@ def _edges(first: RayImage | None) -> rrb.Container:
     graph = [f"{entities.WORLD}/{part}/**" for part in ("model", "poses", "edges")]
     graph += [f"- {entities.CHAIN}", entities.EDGES_1_SIGMA, entities.EDGES_MAGNIFICATION]
     return rrb.Horizontal(
-        _spatial("Pose graph", graph, _far(first)), rrb.Grid(*_readings(), grid_columns=2), name="Edges"
+        spatial("Pose graph", graph, _far(first)), rrb.Grid(*_readings(), grid_columns=2), name="Edges"
     )
 
 
@@ -161,7 +161,7 @@ def _readings() -> list[rrb.View]:
     ]
 
 
-def _spatial(
+def spatial(
     name: str, contents: list[str], eye: rrb.EyeControls3D | None, *, origin: str = entities.WORLD
 ) -> rrb.Spatial3DView:
     """Return a 3D view without a ground grid, for nothing here stands on one."""
@@ -187,9 +187,12 @@ def _eye(first: RayImage, distance_m: float, direction: Array) -> rrb.EyeControl
     )
 
 
-def _near(first: RayImage | None, direction: Array, radii: float) -> rrb.EyeControls3D | None:
+def near(first: RayImage | None, direction: Array, radii: float) -> rrb.EyeControls3D | None:
     """Return an eye that looks at the object from a multiple of its radius away; None before there is one."""
-    return None if first is None else _eye(first, radii * _radius_m(first), direction)
+    if first is None:
+        return None
+    radius_m = float(np.percentile(np.linalg.norm(first.points_m - first.centroid_m, axis=1), 95))  # of most points
+    return _eye(first, radii * radius_m, direction)
 
 
 def _far(first: RayImage | None) -> rrb.EyeControls3D | None:
@@ -197,11 +200,6 @@ def _far(first: RayImage | None) -> rrb.EyeControls3D | None:
     if first is None:
         return None
     return _eye(first, 2.5 * float(np.linalg.norm(first.centroid_m)), graph_view.OVER_THE_RING)
-
-
-def _radius_m(view: RayImage) -> float:
-    """Return the distance from the centroid within which most surface points lie."""
-    return float(np.percentile(np.linalg.norm(view.points_m - view.centroid_m, axis=1), 95))
 
 
 def around(view: RayImage) -> rrb.VisualBounds2D:

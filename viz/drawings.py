@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -58,10 +59,43 @@ def rounded_down(number: float) -> float:
     return max(factor * decade for factor in (1, 2, 5) if factor * decade <= number)
 
 
-def ellipsoids(covariances: Array) -> tuple[Array, Array]:
-    """Return the half axes (n, 3) at one sd and the orientations (n, 4: x, y, z, w) of covariances (n, 3, 3)."""
-    variances, axes = np.linalg.eigh(covariances)
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
-    half_axes = np.sqrt(np.maximum(variances, 0.0))
-    thinnest = np.maximum(0.02 * half_axes.max(axis=1, keepdims=True), 1e-9)  # a disc without thickness is not drawn
-    return np.maximum(half_axes, thinnest), Rotation.from_matrix(axes).as_quat()
+def rotated(poses: Array, covariances: Array) -> Array:
+    """Return covariances (n, 3, 3) along the axes of poses (n, 4, 4) along those in which the poses are."""
+    rotations = poses[:, :3, :3]
+    return rotations @ covariances @ np.swapaxes(rotations, 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoids:
+    """Ellipsoids of one standard deviation, magnified."""
+
+    centres_m: Array
+    """(n, 3)."""
+    half_axes_m: Array
+    """(n, 3)."""
+    quaternions: Array
+    """(n, 4) x, y, z, w."""
+
+    @classmethod
+    def of(cls, centres_m: Array, covariances: Array, factor: float = 1.0) -> Ellipsoids:
+        """Return those of covariances (n, 3, 3) in m² about points (n, 3), `factor` times as large as they are."""
+        variances, axes = np.linalg.eigh(covariances)
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
+        half_axes = np.sqrt(np.maximum(variances, 0.0))
+        thinnest = np.maximum(0.02 * half_axes.max(axis=1, keepdims=True), 1e-9)  # a disc of no thickness is not drawn
+        return cls(centres_m, factor * np.maximum(half_axes, thinnest), Rotation.from_matrix(axes).as_quat())
+
+    def drawn(
+        self, sigmas: float, rgb: entities.Rgb | npt.NDArray[np.uint8], style: rr.components.FillMode
+    ) -> rr.AsComponents:
+        """Return the regions of the given standard deviations in one colour or one each (n, 3); nothing without any."""
+        if len(self.centres_m) == 0:
+            return CLEAR
+        return rr.Ellipsoids3D(
+            centers=self.centres_m,
+            half_sizes=sigmas * self.half_axes_m,
+            quaternions=self.quaternions,
+            colors=rgb,
+            line_radii=rr.Radius.ui_points(0.75),
+            fill_mode=style,
+        )

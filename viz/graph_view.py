@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
 from modeler import se3
@@ -16,7 +14,7 @@ from modeler.export.placing import upright
 from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Array, Camera, Edge, PoseGaussian, Step
 from modeler.viz import entities
-from modeler.viz.drawings import CLEAR, Drawing, caption, ellipsoids, rounded_down, scale_words
+from modeler.viz.drawings import CLEAR, Drawing, Ellipsoids, caption, rotated, rounded_down, scale_words
 from modeler.viz.readings import pose_table
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
@@ -147,51 +145,12 @@ def draw_uncertainty(step: Step) -> Drawing:
     yield entities.POSES, rr.TextDocument(pose_table(step, chain, shown(step)), media_type=rr.MediaType.MARKDOWN)
 
 
-@dataclass(frozen=True, eq=False)
-class _Ellipsoids:
-    """Ellipsoids of one standard deviation, magnified."""
-
-    centres_m: Array
-    """(n, 3)."""
-    half_axes_m: Array
-    """(n, 3)."""
-    quaternions: Array
-    """(n, 4) x, y, z, w."""
-
-    @classmethod
-    def of(cls, centres_m: Array, covariances: Array, factor: float) -> _Ellipsoids:
-        """Return those of covariances (n, 3, 3) in m² about points (n, 3), `factor` times as large as they are."""
-        half_axes_m, quaternions = ellipsoids(covariances)
-        return cls(centres_m, factor * half_axes_m, quaternions)
-
-    def drawn(
-        self, sigmas: float, rgb: entities.Rgb | npt.NDArray[np.uint8], style: rr.components.FillMode
-    ) -> rr.AsComponents:
-        """Return the regions of the given standard deviations in one colour or one each (n, 3); nothing without any."""
-        if len(self.centres_m) == 0:
-            return CLEAR
-        return rr.Ellipsoids3D(
-            centers=self.centres_m,
-            half_sizes=sigmas * self.half_axes_m,
-            quaternions=self.quaternions,
-            colors=rgb,
-            line_radii=rr.Radius.ui_points(0.75),
-            fill_mode=style,
-        )
-
-
-def _positions(poses: Sequence[PoseGaussian], factor: float) -> _Ellipsoids:
+def _positions(poses: Sequence[PoseGaussian], factor: float) -> Ellipsoids:
     """Return the ellipsoids of the positions of poses whose covariance is known."""
     poses = [pose for pose in poses if np.isfinite(pose.covariance).all()]
     means = np.array([pose.mean for pose in poses]).reshape(-1, 4, 4)
     blocks = np.array([pose.covariance[3:, 3:] for pose in poses]).reshape(-1, 3, 3)
-    return _Ellipsoids.of(means[:, :3, 3], _rotated(means, blocks), factor)
-
-
-def _rotated(poses: Array, covariances: Array) -> Array:
-    """Return covariances (n, 3, 3) along the axes of poses (n, 4, 4) along those in which the poses are."""
-    rotations = poses[:, :3, :3]
-    return rotations @ covariances @ np.swapaxes(rotations, 1, 2)
+    return Ellipsoids.of(means[:, :3, 3], rotated(means, blocks), factor)
 
 
 def _of_edges(step: Step, factor: float) -> Drawing:
@@ -206,8 +165,9 @@ def _of_edges(step: Step, factor: float) -> Drawing:
     ends = np.array([[trajectory[edge.target][:3, 3], trajectory[edge.source][:3, 3]] for edge in edges])
     sources = np.array([trajectory[edge.source] for edge in edges]).reshape(-1, 4, 4)
     blocks = np.array([edge.posterior.pose.covariance[3:, 3:] for edge in edges]).reshape(-1, 3, 3)
-    spreads = _Ellipsoids.of(ends.reshape(-1, 2, 3).mean(axis=1), _rotated(sources, blocks), factor)
-    colours = np.array([_edge_rgb(edge) for edge in edges], dtype=np.uint8)
+    spreads = Ellipsoids.of(ends.reshape(-1, 2, 3).mean(axis=1), rotated(sources, blocks), factor)
+    closures = np.array([edge.kind in ("closure", "join") for edge in edges], dtype=np.bool_)
+    colours = np.where(closures[:, None], entities.CLOSURE_RGB, entities.UNCERTAINTY_RGB).astype(np.uint8)
     yield entities.EDGES_1_SIGMA, spreads.drawn(1.0, colours, _SOLID)
     words = f"edges within 1 sd, {scale_words(factor)}"
     yield entities.EDGES_MAGNIFICATION, _below_ring(step, words if edges else "")
@@ -218,28 +178,16 @@ def _below_ring(step: Step, words: str) -> rr.AsComponents:
     return caption(below_ring_m(step), words, entities.UNCERTAINTY_RGB) if words and step.views else CLEAR
 
 
-def _edge_rgb(edge: Edge) -> entities.Rgb:
-    return entities.CLOSURE_RGB if edge.kind in ("closure", "join") else entities.UNCERTAINTY_RGB
-
-
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:
     """Return the factor 0.1, 0.2, 0.5, 1, 2 … 1000 by which uncertainty is magnified.
 
     It follows from the accepted odometry edges alone and never grows with more of them, so that the ellipsoids that
     loop closure makes smaller also look smaller.
     """
-    variances = [
-        _largest_variance(edge.posterior.pose.covariance[3:, 3:])
-        for edge in edges
-        if edge.accepted and edge.kind == "odometry"
-    ]
-    variances = [variance for variance in variances if math.isfinite(variance) and variance > 0.0]
+    blocks = [e.posterior.pose.covariance[3:, 3:] for e in edges if e.accepted and e.kind == "odometry"]
+    variances = [float(np.linalg.eigvalsh(block)[-1]) for block in blocks if np.isfinite(block).all()]
+    variances = [variance for variance in variances if variance > 0.0]
     if not variances:
         return 1.0
     sigma_m = math.sqrt(max(9.0 * variances[0], sum(variances)))  # room for nine edges from the start
     return min(max(rounded_down(_LARGEST_3_SIGMA * distance_m / (3.0 * sigma_m)), 0.1), 1000.0)
-
-
-def _largest_variance(covariance: Array) -> float:
-    """Return the largest eigenvalue of a covariance; NaN where it is not finite."""
-    return float(np.linalg.eigvalsh(covariance)[-1]) if np.isfinite(covariance).all() else float("nan")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -10,11 +9,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
-from PIL import Image
 
 from modeler import se3
 from modeler.kernels import point_likelihood as kernel
 from modeler.registration.visibility import VisibilityLikelihood
+from modeler.system.pictures import encoded
 from modeler.types import Array, BoolArray, Frame, RayImage, SensorNoise, Step
 from modeler.views import Sensor
 from modeler.viz import entities
@@ -38,7 +37,8 @@ def draw_outlined(frame: Frame, mask: BoolArray) -> Drawing:
     if frame.colour is None:
         yield entities.COLOUR, CLEAR
     else:
-        yield entities.COLOUR, _jpeg(frame.colour[::stride, ::stride])
+        jpeg = encoded(frame.colour[::stride, ::stride], "JPEG", quality=_JPEG_QUALITY)
+        yield entities.COLOUR, rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=0.0)
     yield entities.DEPTH, _depth_png(frame.depth_m[::coarse, ::coarse], mask[::coarse, ::coarse])
     stride = coarse if frame.colour is None else stride  # the report lays it over the colours, else over the depth
     yield entities.MASK, rr.SegmentationImage(mask[::stride, ::stride].astype(np.uint8), draw_order=-1.0)
@@ -79,21 +79,12 @@ def depth_stride_px(frame: Frame) -> int:
     return math.ceil(math.sqrt(frame.depth_m.size / _DEPTH_PIXELS))
 
 
-def _jpeg(colour: npt.NDArray[np.uint8]) -> rr.EncodedImage:
-    """Return an RGB image (h, w, 3) as JPEG."""
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(colour)).save(buffer, "JPEG", quality=_JPEG_QUALITY)
-    return rr.EncodedImage(contents=buffer.getvalue(), media_type="image/jpeg", draw_order=0.0)
-
-
 def _depth_png(depth_m: npt.NDArray[np.float32], mask: BoolArray) -> rr.EncodedDepthImage:
     """Return a depth image (h, w) in m as 16-bit PNG, its colours spread over the object and a little around it."""
     units = np.nan_to_num(depth_m * _DEPTH_UNITS_PER_M, nan=0.0, posinf=0.0, neginf=0.0)
-    buffer = io.BytesIO()
     pixels = np.clip(np.rint(units), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1, compress_type=_RUN_LENGTHS)
     return rr.EncodedDepthImage(
-        blob=buffer.getvalue(),
+        blob=encoded(pixels, "PNG", compress_level=1, compress_type=_RUN_LENGTHS),
         media_type="image/png",
         meter=_DEPTH_UNITS_PER_M,
         depth_range=_depth_range(pixels, mask),

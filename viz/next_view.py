@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from modeler.suggestion import Belief, Suggestions
 from modeler.types import RayImage
 from modeler.viz import entities
-from modeler.viz.blueprint import FROM_THE_SIDE
+from modeler.viz.blueprint import FROM_THE_SIDE, framed, near, spatial
 from modeler.viz.drawings import Drawing
 
 WORDS: Final = "next/words"
@@ -37,14 +36,10 @@ def draw_next(belief: Belief, found: Suggestions) -> Drawing:
 
 def tab(first: RayImage | None) -> rrb.Container:
     """Return a layout of observed and unseen surface, the frame, the list, and the values over time."""
-    cells = rrb.Spatial3DView(
-        origin=entities.WORLD,
-        contents=[SEEN_CELLS, UNSEEN_CELLS, entities.CAMERAS, entities.POSITION_3_SIGMA],
-        name="Observed (grey), and where unseen surface may be (orange)",
-        eye_controls=None if first is None else _eye(first),
-    )
-    frame = rrb.Spatial2DView(
-        origin=entities.CAMERA, contents=[entities.COLOUR, entities.OUTLINE], name="Frame, object outlined"
+    cells = spatial(
+        "Observed (grey), and where unseen surface may be (orange)",
+        [SEEN_CELLS, UNSEEN_CELLS, entities.CAMERAS, entities.POSITION_3_SIGMA],
+        near(first, FROM_THE_SIDE, 10.0),
     )
     words = rrb.TextDocumentView(origin=WORDS, name="What to do next, best first")
     times = rrb.Horizontal(
@@ -52,14 +47,5 @@ def tab(first: RayImage | None) -> rrb.Container:
         rrb.TimeSeriesView(origin=POSE_SD, name="Largest standard deviation of a rotation, °"),
     )
     return rrb.Horizontal(
-        rrb.Vertical(cells, times, row_shares=[2.0, 1.0]), rrb.Vertical(frame, words), name="What to do next"
-    )
-
-
-def _eye(first: RayImage) -> rrb.EyeControls3D:
-    centre_m, size_m = first.centroid_m, max(first.size_m, 0.02)
-    return rrb.EyeControls3D(
-        position=centre_m + 7.0 * size_m * FROM_THE_SIDE / np.linalg.norm(FROM_THE_SIDE),
-        look_target=centre_m,
-        eye_up=np.array([0.0, -1.0, 0.0]),
+        rrb.Vertical(cells, times, row_shares=[2.0, 1.0]), rrb.Vertical(framed(first), words), name="What to do next"
     )

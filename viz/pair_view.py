@@ -19,8 +19,9 @@ from modeler.viz.drawings import (
     CLEAR,
     POINT_SIZE,
     Drawing,
+    Ellipsoids,
     caption,
-    ellipsoids,
+    rotated,
     rounded_down,
     scale_words,
     shaded,
@@ -42,31 +43,35 @@ def draw_posterior(step: Step) -> Drawing:
         yield entities.PAIR_AXES, CLEAR
         yield entities.PAIR_DRAWS, CLEAR
         return
-    centre = step.view.centroid_m
-    length_m = axes_length_m(step.view)
-    ends = centre + length_m * np.eye(3)
     mean = posterior.pose.mean
-    colours = np.array(entities.AXIS_RGB, dtype=np.uint8)
     yield (
         entities.PAIR_AXES,
         rr.Arrows3D(
-            origins=np.tile(se3.transform(mean, centre), (3, 1)),
-            vectors=length_m * mean[:3, :3].T,
-            colors=colours,
+            origins=np.tile(se3.transform(mean, step.view.centroid_m), (3, 1)),
+            vectors=axes_length_m(step.view) * mean[:3, :3].T,
+            colors=np.array(entities.AXIS_RGB, dtype=np.uint8),
             radii=rr.Radius.ui_points(0.75),
         ),
     )
-    poses = draws(posterior)
-    points = np.einsum("nij,kj->nki", poses[:, :3, :3], ends) + poses[:, None, :3, 3]
-    yield (
-        entities.PAIR_DRAWS,
-        rr.Points3D(points.reshape(-1, 3), colors=np.tile(colours, (len(poses), 1)), radii=rr.Radius.ui_points(2.0)),
-    )
+    yield entities.PAIR_DRAWS, _tips(step.view, draws(posterior), 2.0)
+
+
+def _tips(view: RayImage, poses: Array, points: float) -> rr.Points3D:
+    """Return the ends of the object's axes at poses (n, 4, 4), as dots of a size on the screen."""
+    ends = view.centroid_m + axes_length_m(view) * np.eye(3)
+    places = np.einsum("nij,kj->nki", poses[:, :3, :3], ends) + poses[:, None, :3, 3]
+    colours = np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(poses), 1))
+    return rr.Points3D(places.reshape(-1, 3), colors=colours, radii=rr.Radius.ui_points(points))
+
+
+def _radius_m(view: RayImage) -> float:
+    """Return the distance of the farthest point from the centroid."""
+    return float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
 
 
 def axes_length_m(view: RayImage) -> float:
     """Return the length of the object's axes as drawn."""
-    return _LENGTH * float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
+    return _LENGTH * _radius_m(view)
 
 
 def draws(posterior: Posterior) -> Array:
@@ -128,7 +133,7 @@ def draw_magnified_posterior(step: Step) -> Drawing:
     dim = np.repeat((_GHOST_LIGHT * colours[ghosts.mode_of]).astype(np.uint8), len(few), axis=0)
     yield entities.GHOSTS, rr.Points3D(points, colors=dim, radii=rr.Radius.ui_points(0.6))
     yield entities.GHOST_MEANS, _means(view, ghosts.modes, colours)
-    yield from _tips(view, ghosts)
+    yield entities.GHOST_TIPS, _tips(view, ghosts.poses, 2.5)
     yield from _centres(view, ghosts, colours)
 
 
@@ -162,7 +167,7 @@ def _nearest(modes: Sequence[Mode], pose: Array) -> int:
 
 def _factor(modes: Sequence[Mode], view: RayImage) -> float:
     """Return the magnification of the samples."""
-    radius_m = float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
+    radius_m = _radius_m(view)
     widest_rad, widest_m = 0.0, 0.0
     for mode in modes:
         covariance = se3.covariance_about(mode.pose.covariance, view.centroid_m)
@@ -185,37 +190,15 @@ def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]
     )
 
 
-def _tips(view: RayImage, ghosts: Ghosts) -> Drawing:
-    """Yield the ends of the object's axes at the samples."""
-    ends = view.centroid_m + axes_length_m(view) * np.eye(3)
-    points = np.einsum("nij,kj->nki", ghosts.poses[:, :3, :3], ends) + ghosts.poses[:, None, :3, 3]
-    colours = np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(ghosts.poses), 1))
-    yield entities.GHOST_TIPS, rr.Points3D(points.reshape(-1, 3), colors=colours, radii=rr.Radius.ui_points(2.5))
-
-
 def _centres(view: RayImage, ghosts: Ghosts, colours: npt.NDArray[np.int64]) -> Drawing:
     """Yield the covariance ellipsoids of the object's centre under every mode, and their captions."""
     poses = np.array([mode.pose.mean for mode in ghosts.modes])
-    rotations = poses[:, :3, :3]
     centres = np.array([se3.transform(pose, view.centroid_m) for pose in poses])
     covariances = np.array([mode.pose.covariance for mode in ghosts.modes])
     blocks = se3.covariance_about(covariances, view.centroid_m)[:, 3:, 3:]
-    half_axes, quaternions = ellipsoids(rotations @ blocks @ np.swapaxes(rotations, 1, 2))
-    for path, sigmas, style in (
-        (entities.GHOST_CENTRE_1_SIGMA, 1.0, rr.components.FillMode.Solid),
-        (entities.GHOST_CENTRE_3_SIGMA, 3.0, rr.components.FillMode.DenseWireframe),
-    ):
-        yield (
-            path,
-            rr.Ellipsoids3D(
-                centers=centres,
-                half_sizes=sigmas * ghosts.factor * half_axes,
-                quaternions=quaternions,
-                colors=entities.UNCERTAINTY_RGB,
-                line_radii=rr.Radius.ui_points(0.5),
-                fill_mode=style,
-            ),
-        )
+    spread, styles = Ellipsoids.of(centres, rotated(poses, blocks), ghosts.factor), rr.components.FillMode
+    yield entities.GHOST_CENTRE_1_SIGMA, spread.drawn(1.0, entities.UNCERTAINTY_RGB, styles.Solid)
+    yield entities.GHOST_CENTRE_3_SIGMA, spread.drawn(3.0, entities.UNCERTAINTY_RGB, styles.DenseWireframe)
     # The heaviest mode's caption stands below the object, the others' one over another above it.
     down = 1.1 * axes_length_m(view) * np.array([1.0, *(-1.0 - 0.25 * np.arange(len(centres) - 1))])
     places = centres[0] + down[:, None] * upright(view)[:, 1]
@@ -245,8 +228,7 @@ def draw_pair(step: Step) -> Drawing:
 
 def below_m(view: RayImage) -> Array:
     """Return a point (3,) below the object of a view, for a caption."""
-    centre = view.centroid_m
-    return centre + 1.2 * float(np.linalg.norm(view.points_m - centre, axis=1).max()) * upright(view)[:, 1]
+    return view.centroid_m + 1.2 * _radius_m(view) * upright(view)[:, 1]
 
 
 def _view_points(view: RayImage, target_from_view: Array, rgb: entities.Rgb) -> rr.Points3D:

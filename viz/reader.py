@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import subprocess
 import sys
 import warnings
@@ -14,8 +13,8 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from PIL import Image
 
+from modeler.system.pictures import encoded
 from modeler.system.processes import environment
 from modeler.viz import entities
 
@@ -111,9 +110,7 @@ def _packed(row: Mapping[str, Any]) -> npt.NDArray[np.uint8]:
     """Return a mask as the bytes (n,) of a PNG, a hundredth of its size, as colour and depth are recorded."""
     shape = row["format"][0].as_py()[0]
     pixels = row["buffer"][0].values[0].values.to_numpy().reshape(shape["height"], shape["width"])
-    content = io.BytesIO()
-    Image.fromarray(pixels > 0).save(content, "PNG")
-    return np.frombuffer(content.getvalue(), np.uint8)
+    return np.frombuffer(encoded(pixels > 0, "PNG"), np.uint8)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from modeler import se3
 from modeler.tracking import ModelRenderer, Tracked
 from modeler.types import BoolArray, Frame, ObjectModel
 from modeler.viz import entities
-from modeler.viz.drawings import CLEAR, POINT_SIZE, Drawing, ellipsoids
+from modeler.viz.drawings import CLEAR, POINT_SIZE, Drawing, Ellipsoids, rotated
 from modeler.viz.images import draw_outlined, stride_px
 from modeler.viz.model_view import mesh
 
@@ -35,16 +35,9 @@ def draw_tracked(frame: Frame, found: Tracked, renderer: ModelRenderer) -> Drawi
         pose = found.pose.mean
         yield entities.TRACKED_MODEL, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
         about = se3.covariance_about(found.pose.covariance, renderer.centre_m)[3:, 3:]
-        half_axes, turned = ellipsoids((pose[:3, :3] @ about @ pose[:3, :3].T)[None])
-        yield (
-            entities.TRACKED_PLACE_3_SIGMA,
-            rr.Ellipsoids3D(
-                centers=se3.transform(pose, renderer.centre_m[None]),
-                half_sizes=3.0 * half_axes,
-                quaternions=turned,
-                colors=entities.UNCERTAINTY_RGB,
-            ),
-        )
+        place = Ellipsoids.of(se3.transform(pose, renderer.centre_m[None]), rotated(pose[None], about[None]))
+        wires = rr.components.FillMode.MajorWireframe
+        yield entities.TRACKED_PLACE_3_SIGMA, place.drawn(3.0, entities.UNCERTAINTY_RGB, wires)
     if found.view is None:
         yield entities.TRACKED_POINTS, CLEAR
     else:

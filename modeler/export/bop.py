@@ -17,6 +17,7 @@ from modeler import se3
 from modeler.export.files import write_atomically
 from modeler.export.formats import ply_bytes
 from modeler.export.placing import Placement
+from modeler.system.pictures import raycaster, tensor
 from modeler.system.regular_files import read_json
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel
 
@@ -60,11 +61,7 @@ def write_bop(model: ObjectModel, out: Path, place: Placement, more: Mapping[str
 
 
 def _entries(path: Path) -> dict[str, Any]:
-    """Return the entries of other objects, by their numbers, in `models_info.json`; its folder is made if missing."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot be used ({error.strerror}); choose another place") from error
+    """Return the entries of other objects, by their numbers, in `models_info.json`."""
     entries = read_json(path) if os.path.lexists(path) else {}
     if not isinstance(entries, dict) or not all(number.isdecimal() for number in entries):
         raise InputError(f"{path}: lists no objects by their numbers; correct it or choose another folder")
@@ -117,17 +114,13 @@ def silhouettes(
         frames: of the cameras.
         camera_from_model: (4, 4), m, by frame number.
     """
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    tensor = o3d.core.Tensor.from_numpy
-    scene.add_triangles(tensor(model.vertices_m.astype(np.float32)), tensor(model.triangles.astype(np.uint32)))
+    scene = raycaster(model.vertices_m, model.triangles)
     for frame in frames:
         pose = camera_from_model[frame.index]
         w, h = frame.camera.rays()
         directions = np.stack([w, h, np.ones_like(w)], axis=-1) @ pose[:3, :3]  # rotated into the model's frame
         origins = np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], directions.shape)
-        rays = tensor(np.concatenate([origins, directions], axis=-1).astype(np.float32))
+        rays = tensor(np.concatenate([origins, directions], axis=-1))
         yield frame, np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import io
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from modeler.export.files import write_atomically
 from modeler.export.formats import mesh_ply
 from modeler.export.placing import CAMERA_AXES
 from modeler.system.extras import check_installed
+from modeler.system.pictures import encoded, raycaster, tensor
 from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl", ".3mf")
@@ -94,17 +94,13 @@ def write_mesh(
     suffix = format_of(out)
     if texture is not None and suffix not in TEXTURED:
         raise InputError(f"{out}: {suffix[1:]} has no textures; use {' or '.join(TEXTURED)}, or leave out the texture")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out.parent}: cannot be made ({error.strerror}); choose another place") from error
     match suffix:
         case ".ply":
             write_atomically(out, mesh_ply(model))
         case ".obj":
             if texture is not None:
                 _, material, image = files_of(out, textured=True)
-                write_atomically(image, png_bytes(texture))
+                write_atomically(image, encoded(texture.image, "PNG"))
                 write_atomically(material, _material(image.name))
             write_atomically(out, _obj(model, "_".join(out.stem.split()), texture, f"{unit}, {axes}"))
         case ".3mf":
@@ -113,15 +109,6 @@ def write_mesh(
             write_atomically(out, _glb(model, texture, object_from_upright))
         case _:
             write_atomically(out, _stl(model, unit))
-
-
-def png_bytes(texture: Texture) -> bytes:
-    """Return the image of a texture as PNG."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(texture.image).save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def _material(image: str) -> str:
@@ -386,14 +373,10 @@ def _baked(model: ObjectModel, places_px: Array, side_px: int, paint: Paint) -> 
         side_px: s.
         paint: gives points their colours.
     """
-    import open3d as o3d
-
-    flat = np.concatenate([places_px, np.zeros((len(places_px), 1))], axis=1).astype(np.float32)
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor.from_numpy(flat), o3d.core.Tensor.from_numpy(model.triangles.astype(np.uint32)))
+    flat = np.concatenate([places_px, np.zeros((len(places_px), 1))], axis=1)
     columns, rows = np.meshgrid(np.arange(side_px) + 0.5, np.arange(side_px) + 0.5)
     pixels = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3).astype(np.float32)
-    found = scene.compute_closest_points(o3d.core.Tensor.from_numpy(pixels))
+    found = raycaster(flat, model.triangles).compute_closest_points(tensor(pixels))
     off = np.linalg.norm(found["points"].numpy() - pixels, axis=1)
     near = off <= PADDING_PX
     triangle = model.triangles[found["primitive_ids"].numpy()[near].astype(np.int64)]

@@ -6,7 +6,6 @@ transparent black and by masks.
 
 from __future__ import annotations
 
-import io
 import json
 import struct
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from modeler import se3
 from modeler.export.bop import silhouettes
 from modeler.export.files import write_atomically
 from modeler.export.formats import ply_bytes
+from modeler.system.pictures import encoded
 from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel
 
 MOST_POINTS: Final = 20_000
@@ -29,7 +29,6 @@ MOST_POINTS: Final = 20_000
 _PIXEL_CENTRE: Final = 0.5  # nerfstudio and COLMAP measure from the corner of the first pixel
 _OPENGL_AXES: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, z backward
 _PINHOLE: Final = 1  # COLMAP's number of the model without distortion
-_DEPTH_MM: Final = 1.0  # nerfstudio's unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +111,9 @@ def write_nerfstudio(data: PosedImages, folder: Path) -> None:
     for number, frame in data.frames.items():
         name = f"{number:06d}.png"
         _write_images(frame, folder / "images" / name, folder / "masks" / name)
-        depth_mm = np.where(object_of(frame) & np.isfinite(frame.depth_m), 1000.0 * frame.depth_m / _DEPTH_MM, 0.0)
-        write_atomically(folder / "depth" / name, _png(np.clip(np.rint(depth_mm), 0, 65535).astype(np.uint16)))
+        depth_mm = np.where(object_of(frame) & np.isfinite(frame.depth_m), 1000.0 * frame.depth_m, 0.0)
+        depth = np.clip(np.rint(depth_mm), 0, 65535).astype(np.uint16)
+        write_atomically(folder / "depth" / name, encoded(depth, "PNG"))
         entries.append(
             {
                 "file_path": f"images/{name}",
@@ -220,16 +220,9 @@ def _write_images(frame: Frame, image: Path, mask: Path) -> None:
     """Write the object, transparent black around it, and its mask."""
     assert frame.colour is not None
     alpha = object_of(frame).astype(np.uint8) * np.uint8(255)
-    write_atomically(image, _png(np.dstack([np.where(alpha[..., None], frame.colour, 0).astype(np.uint8), alpha])))
-    write_atomically(mask, _png(alpha))
-
-
-def _png(pixels: npt.NDArray[Any]) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG")
-    return buffer.getvalue()
+    pixels = np.dstack([np.where(alpha[..., None], frame.colour, 0).astype(np.uint8), alpha])
+    write_atomically(image, encoded(pixels, "PNG"))
+    write_atomically(mask, encoded(alpha, "PNG"))
 
 
 def share_within_masks(folder: Path) -> float:

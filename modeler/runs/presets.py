@@ -17,7 +17,7 @@ import numpy as np
 from modeler import export as files
 from modeler import se3
 from modeler.export import bop, solids
-from modeler.export.mesh import TRIANGLES, Texture, png_bytes
+from modeler.export.mesh import TRIANGLES, Texture
 from modeler.export.placing import model_up
 from modeler.export.posed_images import (
     PosedImages,
@@ -32,6 +32,7 @@ from modeler.runs.outputs import check_files, check_folder, run_inputs
 from modeler.runs.reopening import Reopened, reopened
 from modeler.sequences import finest_unit_mm, write_bop
 from modeler.system.extras import check_installed
+from modeler.system.pictures import encoded
 from modeler.types import Array, InputError, ObjectModel
 
 _MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}
@@ -237,7 +238,7 @@ class Preset:
         of = solid.of
         write_usd(of, solid.model, solid.texture, solid.body, solid.parts)
         if solid.texture is not None:
-            files.write_atomically(of.texture, png_bytes(solid.texture))
+            files.write_atomically(of.texture, encoded(solid.texture.image, "PNG"))
         solid.place.write(of.usd)
         return Checks().also(*opened_usd(of.usd)).and_also(solid.checks())
 

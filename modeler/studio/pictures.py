@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -11,6 +10,7 @@ import numpy.typing as npt
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from modeler.system.pictures import encoded
 from modeler.types import BoolArray, Frame
 from modeler.viz.entities import OUTLINE_RGB
 from modeler.viz.images import outline
@@ -35,7 +35,7 @@ def picture(frame: Frame) -> npt.NDArray[np.uint8]:
 
 def jpeg(frame: Frame) -> bytes:
     """Return a frame as JPEG."""
-    return _encoded(Image.fromarray(np.ascontiguousarray(picture(frame))))
+    return encoded(picture(frame), "JPEG", quality=_JPEG_QUALITY)
 
 
 def thumbnail(frame: Frame, mask: BoolArray | None) -> bytes:
@@ -45,7 +45,7 @@ def thumbnail(frame: Frame, mask: BoolArray | None) -> bytes:
         pixels = np.where(mask[..., None], pixels, pixels // 3)
     image = Image.fromarray(np.ascontiguousarray(pixels.astype(np.uint8)))
     image.thumbnail((4 * THUMBNAIL_PX, THUMBNAIL_PX))
-    return _encoded(image)
+    return encoded(np.asarray(image), "JPEG", quality=_JPEG_QUALITY)
 
 
 def outline_svg(mask: BoolArray | None) -> str:
@@ -115,9 +115,3 @@ def ring_svg(report: Mapping[str, Any]) -> str:
         "<circle cx='50' cy='50' r='38' fill='none' stroke='#b9c3cc' stroke-width='2' stroke-dasharray='3 3'/>"
         f"<rect x='42' y='42' width='16' height='16' rx='3' fill='#b9c3cc'/>{dots}</svg>"
     )
-
-
-def _encoded(image: Image.Image) -> bytes:
-    buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=_JPEG_QUALITY)
-    return buffer.getvalue()

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import json
 import threading
 from pathlib import Path
 from typing import final
 
 import numpy as np
-from PIL import Image
 
 from modeler.export import write_atomically
 from modeler.sequences import AbstractSequence, finest_unit_mm
 from modeler.sequences.live import REACH_M
+from modeler.system.pictures import encoded
 from modeler.types import Frame, InputError
 
 
@@ -66,14 +65,8 @@ class Recorder:
             known = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "depth_scale": unit_mm}
             write_atomically(self.folder / "camera.json", json.dumps(known) + "\n")
         if frame.colour is not None:
-            write_atomically(self.folder / "rgb" / name, _png(frame.colour))
+            write_atomically(self.folder / "rgb" / name, encoded(frame.colour, "PNG", compress_level=1))
         near_m = np.where((frame.depth_m > 0.0) & (frame.depth_m < REACH_M), frame.depth_m, 0.0)
         depth = np.rint(near_m * (1000.0 / unit_mm)).astype(np.uint16)
-        write_atomically(self.folder / "depth" / name, _png(depth))
+        write_atomically(self.folder / "depth" / name, encoded(depth, "PNG", compress_level=1))
         self.taken += 1
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", compress_level=1)
-    return buffer.getvalue()

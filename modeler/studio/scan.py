@@ -25,6 +25,7 @@ from modeler.export import FORMATS, RunFolder, write_atomically
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import AbstractSequence, KeptSequence, finest_unit_mm, open_sequence, scene_meta, write_bop
 from modeler.studio.jobs import Job
+from modeler.system.pictures import encoded
 from modeler.system.regular_files import read_regular
 from modeler.types import BoolArray, Camera, InputError, Outcome, Segmentation
 
@@ -402,9 +403,7 @@ class Scan:
             self._changed()
 
     def _keep_painted(self, frame: int, mask: BoolArray) -> None:
-        buffer = io.BytesIO()
-        Image.fromarray(mask.astype(np.uint8) * 255).save(buffer, "PNG")
-        write_atomically(self._painted_file(frame), buffer.getvalue())
+        write_atomically(self._painted_file(frame), encoded(mask.astype(np.uint8) * 255, "PNG"))
         self.painted[frame] = mask
         self.strokes[frame] = self.strokes.get(frame, 0) + 1
         self._choose(masked=None)

@@ -1,4 +1,4 @@
-"""What the renderer does with meshes: ray casting (its only use of Open3D), the outer surface, PLY."""
+"""What the renderer does with meshes: ray casting, the outer surface, PLY."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.sequences.meshes import IntArray, Mesh
+from modeler.system.pictures import raycaster, tensor
 from modeler.types import Array, BoolArray
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ class Caster:
 
     @cached_property
     def _scene(self) -> o3d.t.geometry.RaycastingScene:
-        return _scene(self.mesh)
+        return raycaster(self.mesh.vertices_m, self.mesh.triangles)
 
     def cast(self, rays: Array, camera_from_mesh: Array) -> Hits:
         """Follow rays (h, w, 3) of unit depth from the camera's centre."""
@@ -87,7 +88,7 @@ class Caster:
         mesh_from_camera = se3.inverse(camera_from_mesh)
         turned = rays @ mesh_from_camera[:3, :3].T
         origins = np.broadcast_to(mesh_from_camera[:3, 3], turned.shape)
-        found = self._scene.cast_rays(_tensor(np.concatenate([origins, turned], axis=-1)))
+        found = self._scene.cast_rays(tensor(np.concatenate([origins, turned], axis=-1)))
         depth_m = found["t_hit"].numpy().astype(np.float64)
         met = np.isfinite(depth_m)
         depth_m = np.where(met, depth_m, np.nan)
@@ -106,27 +107,13 @@ class Caster:
         lamp = se3.transform(mesh_from_camera, lamp_m)
         away = (np.nan_to_num(points_m) - lamp_m) @ mesh_from_camera[:3, :3].T
         rays = np.concatenate([np.broadcast_to(lamp, away.shape), away], axis=-1)
-        return self._scene.test_occlusions(_tensor(rays), tnear=0.0, tfar=_SHORT).numpy()
+        return self._scene.test_occlusions(tensor(rays), tnear=0.0, tfar=_SHORT).numpy()
 
 
 def inside(mesh: Mesh, points_m: Array) -> BoolArray:
     """Return which points (n, 3) lie inside one closed part."""
-    return _scene(mesh).compute_occupancy(_tensor(points_m), nsamples=3).numpy() > 0.5
-
-
-def _scene(mesh: Mesh) -> o3d.t.geometry.RaycastingScene:
-    import open3d as o3d  # takes a second to import
-
-    scene = o3d.t.geometry.RaycastingScene()
-    if len(mesh.triangles):
-        scene.add_triangles(_tensor(mesh.vertices_m), o3d.core.Tensor.from_numpy(mesh.triangles.astype(np.uint32)))
-    return scene
-
-
-def _tensor(values: Array) -> o3d.core.Tensor:
-    import open3d as o3d
-
-    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+    found = raycaster(mesh.vertices_m, mesh.triangles).compute_occupancy(tensor(points_m), nsamples=3)
+    return found.numpy() > 0.5
 
 
 _COARSE_M, _FINE_M = 0.01, 0.001

@@ -17,6 +17,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from modeler import evaluation, se3
+from modeler.system.pictures import encoded
 from modeler.types import ACCEPTED, Array, Edge, Outcome, explain
 from modeler.verdict.evidence import MAX_POINTS
 from modeler.viz import entities
@@ -302,7 +303,7 @@ def _outlined(
         _mark(pixels, marks, np.array(box) / picture.width * marks.size[1], int(np.count_nonzero(on)))
     line = ndimage.binary_dilation(on) != ndimage.binary_erosion(on, border_value=1)
     pixels[line] = entities.OUTLINE_RGB
-    return _jpeg(Image.fromarray(pixels.astype(np.uint8)))
+    return _jpeg(pixels.astype(np.uint8))
 
 
 def _mark(pixels: Array, marks: Marks, box: Array, area: int) -> None:
@@ -368,13 +369,11 @@ def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
     columns, rows = (places[order] + np.tile(_DOT, (len(points), 1))).astype(np.int64).T
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     picture[rows[inside], columns[inside]] = colours[order][inside]
-    return _jpeg(Image.fromarray(picture))
+    return _jpeg(picture)
 
 
-def _jpeg(picture: Image.Image) -> bytes:
-    content = io.BytesIO()
-    picture.save(content, "JPEG", quality=_JPEG_QUALITY, subsampling=0)  # thin lines keep their colour
-    return content.getvalue()
+def _jpeg(pixels: npt.NDArray[np.uint8]) -> bytes:
+    return encoded(pixels, "JPEG", quality=_JPEG_QUALITY, subsampling=0)  # thin lines keep their colour
 
 
 def data_address(content: bytes, kind: str) -> str:

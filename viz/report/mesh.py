@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from modeler.export import read_model
 from modeler.export.mesh import sigma_rgb
+from modeler.system.pictures import encoded, raycaster, tensor
 from modeler.types import Array, InputError
 from modeler.viz.model_view import coarsened
 
@@ -105,6 +104,7 @@ def _packed(array: npt.NDArray[Any]) -> str:
 
 
 _FIELD_OF_VIEW_DEG: Final = 30.0  # vertical
+_SAMPLES: Final = 2  # rays along each side of a pixel, without which edges are jagged
 
 
 def shade(
@@ -113,8 +113,6 @@ def shade(
     colours: npt.NDArray[np.uint8] | None,
     object_from_camera: Array,
     size: tuple[int, int],
-    *,
-    samples: int = 2,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (h, w, 3) of a mesh under a light next to the camera, on white; back sides are drawn red.
 
@@ -124,16 +122,8 @@ def shade(
         colours: (v, 3) RGB; None = grey.
         object_from_camera: (4, 4) pose of the camera (x right, y down, z forward) in the mesh's frame.
         size: height and width in px.
-        samples: rays along each side of a pixel.
     """
-    import open3d as o3d  # slow to import, and nothing else of viz needs it
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices_m, dtype=np.float32)),
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
-    )
-    height, width = size[0] * samples, size[1] * samples
+    height, width = size[0] * _SAMPLES, size[1] * _SAMPLES
     focal = 0.5 * height / np.tan(np.radians(0.5 * _FIELD_OF_VIEW_DEG))
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
     along = np.stack(
@@ -143,7 +133,7 @@ def shade(
     rays = np.empty((height, width, 6), dtype=np.float32)
     rays[..., :3] = object_from_camera[:3, 3]
     rays[..., 3:] = along @ object_from_camera[:3, :3].T
-    hits = {name: value.numpy() for name, value in scene.cast_rays(o3d.core.Tensor.from_numpy(rays)).items()}
+    hits = {name: value.numpy() for name, value in raycaster(vertices_m, triangles).cast_rays(tensor(rays)).items()}
     seen = np.isfinite(hits["t_hit"])
 
     corners = triangles[hits["primitive_ids"][seen].astype(np.int64)]
@@ -161,7 +151,7 @@ def shade(
     lit = np.where(facing < 0.0, 0.4 - 0.6 * facing, lit)
     picture = np.full((height, width, 3), 255.0)
     picture[seen] = base * (0.25 + 0.75 * lit)[:, None]
-    blocks = picture.reshape(size[0], samples, size[1], samples, 3)
+    blocks = picture.reshape(size[0], _SAMPLES, size[1], _SAMPLES, 3)
     return np.clip(np.rint(blocks.mean(axis=(1, 3))), 0, 255).astype(np.uint8)
 
 
@@ -175,10 +165,7 @@ def portrait(mesh: Mesh, object_from_upright: Array, size: tuple[int, int]) -> b
     """
     away = object_from_upright @ _ABOVE_LEFT
     camera = look_at(mesh.centre_m, away, 4.2 * mesh.radius_m, -object_from_upright[:, 1])
-    content = io.BytesIO()
-    picture = Image.fromarray(shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, size))
-    picture.save(content, "JPEG", quality=85)
-    return content.getvalue()
+    return encoded(shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, size), "JPEG", quality=85)
 
 
 def look_at(centre_m: Array, direction: Array, distance_m: float, up: Array) -> Array:
