@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, final
+from typing import Final, Self, final
 
 from modeler.types import Array, Frame, InputError, SensorNoise
 
@@ -205,6 +205,36 @@ class AbstractDerived(AbstractSequence):
     def until(self, stop: Callable[[], bool]) -> AbstractSequence:
         """Return the sequence, which, if live, ends as soon as `stop()` is true."""
         return replace(self, whole=self.whole.until(stop))
+
+
+@dataclass(frozen=True)
+class AbstractLive(AbstractSequence):
+    """A sequence to which frames are still added."""
+
+    every: int = field(default=1, kw_only=True)
+    """Stride over the frames."""
+    kept: slice = field(default_factory=lambda: slice(None, None), kw_only=True)
+    """Keep these frame numbers."""
+    stop: Callable[[], bool] = field(default=lambda: False, kw_only=True)
+    """Polled while waiting; true ends the sequence."""
+
+    @property
+    def live(self) -> bool:
+        """True: more frames come."""
+        return True
+
+    def until(self, stop: Callable[[], bool]) -> Self:
+        """Return the sequence that ends when it is asked to."""
+        return replace(self, stop=stop)
+
+    def select(self, every: int = 1, frames: slice | None = None) -> Self:
+        """Return a part of the sequence, of present and future frames.
+
+        Raises:
+            InputError: if `every` keeps nothing.
+        """
+        check_every(every)
+        return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
 
 
 @final

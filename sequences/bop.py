@@ -75,11 +75,6 @@ def camera_from_model(node: Node) -> Array:
     return pose
 
 
-def camera_entry(matrix: Array, scale_mm: float) -> dict[str, object]:
-    """Return the entry of `scene_camera.json` for intrinsics (3, 3) in px."""
-    return {"cam_K": [float(value) for value in matrix.ravel()], "depth_scale": scale_mm}
-
-
 def _occluder_names(stem: str) -> tuple[str, str]:
     """Return the names that the mask of an occluder may have, given that of the depth image without its suffix."""
     return f"{stem}.png", f"{stem}_000000.png"
@@ -364,8 +359,8 @@ def _fill(
     times_s: dict[str, float] = {}
     for frame in frames:
         camera, stem = frame.camera, f"{frame.index:06d}"
-        matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        cameras[str(frame.index)] = camera_entry(matrix, depth_scale_mm)
+        matrix = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+        cameras[str(frame.index)] = {"cam_K": [*map(float, matrix)], "depth_scale": depth_scale_mm}
         times_s[str(frame.index)] = frame.time_s
         _image(folder / "depth" / f"{stem}.png", _raw_depth(frame, depth_scale_mm))
         if frame.mask is not None:
@@ -406,9 +401,6 @@ def _json(path: Path, content: Mapping[str, object], indent: int | None = None) 
     path.write_text(text, encoding="utf-8")
 
 
-_MM = 1e-3
-
-
 def true_mesh(sequence: AbstractSequence) -> Mesh:
     """Return the true surface in m, in the model frame of `sequence.truth()`.
 
@@ -423,7 +415,7 @@ def true_mesh(sequence: AbstractSequence) -> Mesh:
     if isinstance(sequence, BopSequence):
         found = _of_dataset(sequence.path)
         if found is not None:
-            return read_mesh(found, _MM)
+            return read_mesh(found, 1e-3)
     raise InputError(
         f"{sequence.name}: has no true surface to compare with; put model.ply (m) next to its frames, or BOP's models "
         "folder (mm) next to its split"

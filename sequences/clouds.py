@@ -48,16 +48,6 @@ class CloudSequence(AbstractRecording):
     """Of the coordinates."""
     is_organised: bool = True
     """Whether each cloud has a point a pixel."""
-    remarks: tuple[str, ...] = ()
-    """Assumptions and omissions of the reader."""
-
-    def __post_init__(self) -> None:
-        """Check `sequence.json`.
-
-        Raises:
-            InputError: if it cannot be used.
-        """
-        _ = self.name, self.sensor(), self.motion
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -103,11 +93,6 @@ class CloudSequence(AbstractRecording):
         """Unit of the coordinates."""
         return f"{'m' if self.unit_mm == 1000.0 else f'{self.unit_mm:g} mm'} ({self.unit_source})"
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Where the camera comes from, and what is assumed of the axes."""
-        return self.remarks
-
 
 Axes = Literal["camera", "viewer", "body"]
 _CAMERA_FROM: Final[Mapping[Axes, Array]] = {
@@ -143,7 +128,7 @@ def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
             continue
         camera, (unit_mm, who) = Camera(columns, rows, *intrinsics), _unit_mm(turned, overrides)
         said = (*_SAID[axes], *remarks, *said_of_angles(clouds))
-        return CloudSequence(path, clouds, unit_mm, who, camera, axes, first.size[1] > 1, said)
+        return CloudSequence(path, clouds, unit_mm, who, camera, axes, first.size[1] > 1, remarks=said)
     raise refused[0]
 
 

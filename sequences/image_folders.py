@@ -87,28 +87,8 @@ class ImageFolderSequence(AbstractRecording):
     unit_source: str
     read_truth: Callable[[], dict[int, Array] | None] = lambda: None
     """Reads the true camera_from_model (4, 4) in m by frame number, when it is asked for."""
-    remarks: tuple[str, ...] = ()
-    """Assumptions and omissions of the reader."""
     video: Video | None = None
     """Colour by frame number, where it is no files."""
-
-    def __post_init__(self) -> None:
-        """Check `sequence.json`.
-
-        Raises:
-            InputError: if it cannot be used.
-        """
-        _ = self.name, self.sensor(), self.motion
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the intrinsics are of a calibration of this camera."""
-        return self.camera.calibrated
-
-    @property
-    def kind(self) -> str | None:
-        """Kind of the depth camera, where the files are those of a phone."""
-        return "tof" if self.camera.of_phone else None
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -343,6 +323,8 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
         unit_source=who,
         read_truth=lambda: _posed_truth(path, numbers),
         remarks=tuple(remarks),
+        calibrated=facts.calibrated,
+        kind="tof" if facts.of_phone else None,
         video=video,
     )
 

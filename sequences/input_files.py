@@ -97,6 +97,23 @@ def check_link(path: Path, root: Path) -> None:
         raise InputError(f"{path}: leads out of the sequence, to {target}; put the file itself there.")
 
 
+def listed(by: Path, name: str) -> Path:
+    """Return a file that a list in the same folder names.
+
+    Raises:
+        InputError: if it is not there, or its name leads out of the folder.
+    """
+    name = name.strip()
+    if not name.isprintable():
+        raise InputError(f"{by}: names a file with control characters; correct it there.")
+    path = by.parent / name
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        check_link(path, by.parent)
+    if not is_there(path):
+        raise InputError(f"{by}: names {name}, which is not there; add it, or remove its entry.")
+    return path
+
+
 def check_links(root: Path) -> None:
     """Refuse a folder in which a link, at whatever depth, leads out of it, whether or not the link would be read.
 

@@ -122,18 +122,6 @@ class KinectSequence(AbstractStreams[int]):
     """Where the colour camera is; None without colour."""
     unit_mm: float
     """Millimetres per unit of depth."""
-    by_maker: bool = True
-    """Whether the intrinsics are the maker's, not the user's."""
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the intrinsics are of a calibration of this camera."""
-        return self.by_maker
-
-    @property
-    def kind(self) -> str:
-        """Kind of the depth camera."""
-        return "tof"
 
     def seen_m(self, index: int, stamp: int) -> npt.NDArray[np.float32]:
         """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
@@ -187,8 +175,8 @@ def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
         alignment = Alignment(lens.camera, colour_lens(calibration, colour_size), colour_from_depth(calibration))
     unit_mm = 1.0 if overrides.depth_scale_mm is None else overrides.depth_scale_mm
     pairs, left = paired(stamps, colours)
-    by_maker = overrides.intrinsics is None
-    return KinectSequence(path, lens, pairs, tuple(left), file, alignment, unit_mm, by_maker)
+    about = {"remarks": tuple(left), "calibrated": overrides.intrinsics is None, "kind": "tof"}
+    return KinectSequence(path, lens, pairs, file, alignment, unit_mm, **about)
 
 
 _HOLE_BYTES = 1 << 30  # which the library reads in a second

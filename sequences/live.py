@@ -6,13 +6,13 @@ import importlib
 import itertools
 import weakref
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from modeler.sequences.base import AbstractSequence, check_every, span
+from modeler.sequences.base import AbstractLive, AbstractSequence, span
 from modeler.sequences.depth_files import metres
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens, coefficients
@@ -71,19 +71,13 @@ def in_a_line(error: Exception) -> str:
 
 @final
 @dataclass(frozen=True)
-class LiveSequence(AbstractSequence):
+class LiveSequence(AbstractLive):
     """Images of a running camera, taken on demand until `stop()` is true."""
 
     camera: RunningCamera
     """The running camera."""
     seen: tuple[Frame, ...]
     """Its first frame."""
-    every: int = 1
-    """Stride over the images."""
-    kept: slice = field(default_factory=lambda: slice(None, None))
-    """Keep these frame numbers."""
-    stop: Callable[[], bool] = lambda: False
-    """Polled before each image; true ends the sequence."""
     by_maker: bool = True
     """Whether the intrinsics are the maker's, not the user's."""
 
@@ -106,11 +100,6 @@ class LiveSequence(AbstractSequence):
         """Numbers of the first frames."""
         return tuple(frame.index for frame in self.seen)
 
-    @property
-    def live(self) -> bool:
-        """True: more frames come."""
-        return True
-
     def recorded(self) -> AbstractSequence:
         """Return the sequence of the first frames alone."""
         return replace(self, stop=lambda: True)
@@ -127,19 +116,6 @@ class LiveSequence(AbstractSequence):
         low, high = self.kept.start or 0, self.kept.stop
         frames = itertools.chain(self.seen, self._coming())
         yield from itertools.islice(frames, low, high, self.every)
-
-    def until(self, stop: Callable[[], bool]) -> LiveSequence:
-        """Return the sequence that ends when it is asked to."""
-        return replace(self, stop=stop)
-
-    def select(self, every: int = 1, frames: slice | None = None) -> LiveSequence:
-        """Return a part of the sequence.
-
-        Raises:
-            InputError: if nothing is left.
-        """
-        check_every(every)
-        return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
 
     @property
     def layout(self) -> str:

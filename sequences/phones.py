@@ -15,7 +15,7 @@ import numpy as np
 from modeler.sequences.depth_files import metres
 from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, resize_to_depth
 from modeler.sequences.image_folders import FoundImages
-from modeler.sequences.input_files import Node, check_link, input_errors, is_there, read_tree
+from modeler.sequences.input_files import Node, input_errors, is_there, listed, read_tree
 from modeler.sequences.intrinsics import Overrides, camera_of
 from modeler.sequences.recording import AbstractRecording
 from modeler.system.extras import install_command
@@ -36,18 +36,6 @@ class Record3DSequence(AbstractRecording):
     """Of the depth images."""
     times_s: tuple[float, ...]
     """By frame number, from 0."""
-    by_maker: bool = True
-    """Whether the intrinsics are the recording's, not the user's."""
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the intrinsics are of a calibration of this camera."""
-        return self.by_maker
-
-    @property
-    def kind(self) -> str:
-        """Kind of the depth camera."""
-        return "tof"
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -79,11 +67,6 @@ class Record3DSequence(AbstractRecording):
     def depth_unit(self) -> str:
         """Unit of stored depth."""
         return "1000 mm (of the format)"
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Assumptions and omissions of the reader."""
-        return ("depth of confidence 0 is left out",)
 
     def _unpacked(self, name: str, size: tuple[int, int], kind: str) -> np.ndarray[Any, Any]:
         try:
@@ -139,7 +122,9 @@ def open_record3d(path: Path, overrides: Overrides) -> Record3DSequence:
     times_s = [float(index) / (30.0 if rate is None else rate.number(1e-3, 1e4)) for index in range(count)]
     if stamps is not None and len(stamps.elements()) == count:
         times_s = [stamp.number() for stamp in stamps.elements()]
-    return Record3DSequence(path, Camera(width, height, *intrinsics), tuple(times_s), overrides.intrinsics is None)
+    camera, said = Camera(width, height, *intrinsics), ("depth of confidence 0 is left out",)
+    calibrated = overrides.intrinsics is None
+    return Record3DSequence(path, camera, tuple(times_s), remarks=said, calibrated=calibrated, kind="tof")
 
 
 def images_of_transforms(path: Path) -> FoundImages | None:
@@ -151,26 +136,15 @@ def images_of_transforms(path: Path) -> FoundImages | None:
     if not is_there(path / "transforms.json"):
         return None
     frames = read_tree(path / "transforms.json").get("frames")
-    listed = [] if frames is None else [frame for frame in frames.elements() if frame.get("depth_file_path")]
-    if not listed:
+    shown = [] if frames is None else [frame for frame in frames.elements() if frame.get("depth_file_path")]
+    if not shown:
         return None
 
     def named(key: str) -> dict[str, Path]:
         return {
-            Path(frame.need("depth_file_path").text()).stem: _listed(path, entry)
-            for frame in listed
+            Path(frame.need("depth_file_path").text()).stem: listed(path / "transforms.json", entry.text())
+            for frame in shown
             if (entry := frame.get(key)) is not None
         }
 
     return FoundImages(named("depth_file_path"), named("file_path"), named("mask_path"))
-
-
-def _listed(root: Path, entry: Node) -> Path:
-    """Return an image of a folder by its entry in a list."""
-    name = Path(entry.text())
-    path = root / name
-    if name.is_absolute() or ".." in name.parts:
-        check_link(path, root)
-    if not is_there(path):
-        raise InputError(f"{root / 'transforms.json'}: names {name}, which is not there; add it, or remove the entry.")
-    return path

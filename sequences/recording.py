@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Final, Generic, TypeVar, final
@@ -36,6 +36,25 @@ class AbstractRecording(AbstractSequence):
 
     path: Path
     """The folder or the file."""
+    remarks: tuple[str, ...] = field(default=(), kw_only=True)
+    """Assumptions and omissions of the reader, and of the format."""
+    calibrated: bool = field(default=False, kw_only=True)
+    """Whether the intrinsics are of a calibration of this camera, not typed in or nominal."""
+    kind: str | None = field(default=None, kw_only=True)
+    """Kind of the depth camera, of `MULTIPATH`, where the format tells it."""
+
+    def __post_init__(self) -> None:
+        """Check `sequence.json`.
+
+        Raises:
+            InputError: if it cannot be used.
+        """
+        _ = self.name, self.sensor(), self.motion
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Assumptions and omissions of the reader."""
+        return self.remarks
 
     @property
     def name(self) -> str:
@@ -48,16 +67,6 @@ class AbstractRecording(AbstractSequence):
     def inputs(self) -> tuple[Path, ...]:
         """The folder or the file."""
         return (self.path,)
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the intrinsics are of a calibration of this camera, not typed in or nominal."""
-        return False
-
-    @property
-    def kind(self) -> str | None:
-        """Kind of the depth camera, of `MULTIPATH`, where the format tells it."""
-        return None
 
     def sensor(self) -> SensorNoise | None:
         """Return the noise of the camera from `sequence.json` and as the format tells it; None if neither says."""
@@ -181,8 +190,6 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
     """The depth camera."""
     pairs: Mapping[int, ImagePair[Stamp]]
     """By frame number: places in order of time."""
-    remarks: tuple[str, ...]
-    """Assumptions and omissions of the reader."""
 
     @abstractmethod
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
@@ -213,11 +220,6 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
         depth_m = self.lens.undistort(self.seen_m(index, pair.depth), float("nan"))
         colour = None if pair.colour is None else self.colour_at(index, pair.colour, depth_m)
         return Frame(index, pair.time_s, depth_m, self.lens.camera, None, colour)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Assumptions and omissions of the reader."""
-        return self.remarks
 
 
 def paired(

@@ -13,13 +13,7 @@ from modeler import se3
 from modeler.sequences.depth_files import depth_size
 from modeler.sequences.image_files import MASK_SUFFIXES
 from modeler.sequences.image_folders import FARTHEST_M, OCCLUDER_FOLDERS, FrameFiles, ImageFolderSequence
-from modeler.sequences.input_files import (
-    check_link,
-    first_folder,
-    is_there,
-    list_images,
-    read_text,
-)
+from modeler.sequences.input_files import first_folder, is_there, list_images, listed, read_text
 from modeler.sequences.intrinsics import CameraFacts, Overrides, find_intrinsics
 from modeler.sequences.recording import paired
 from modeler.types import Array, InputError
@@ -49,8 +43,8 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
     pairs, remarks = paired(depth, colour)
     files: dict[int, FrameFiles] = {}
     for index, pair in pairs.items():
-        image = _listed(path, "depth.txt", pair.depth[0])
-        colour_path = None if pair.colour is None else _listed(path, "rgb.txt", pair.colour[0])
+        image = listed(path / "depth.txt", pair.depth[0])
+        colour_path = None if pair.colour is None else listed(path / "rgb.txt", pair.colour[0])
         mask, occluder = (
             some.get(image.stem) or (None if colour_path is None else some.get(colour_path.stem))
             for some in (masks, occluders)
@@ -84,6 +78,8 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
         unit_source=who,
         read_truth=lambda: _tum_truth(path / "groundtruth.txt", [time for time, _ in depth]),
         remarks=tuple(remarks),
+        calibrated=found.calibrated,
+        kind="tof" if found.of_phone else None,
     )
 
 
@@ -146,16 +142,3 @@ def _list(path: Path, words: int) -> list[tuple[float, list[str]]]:
             raise InputError(f"{path}: line {number}: its time {how} that of the line above; sort, and remove doubles.")
         lines.append((time_s, rest))
     return lines
-
-
-def _listed(root: Path, by: str, name: str) -> Path:
-    """Return an image file named in a list."""
-    name = name.strip()
-    if not name.isprintable():
-        raise InputError(f"{root / by}: names an image with control characters; correct it there.")
-    path = root / name
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        check_link(path, root)
-    if not is_there(path):
-        raise InputError(f"{root / by}: names {name}, which is not there; add the image or remove the line.")
-    return path

@@ -7,11 +7,11 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, final
 
-from modeler.sequences.base import FIRST, AbstractDerived, AbstractSequence, check_every
+from modeler.sequences.base import FIRST, AbstractDerived, AbstractLive, AbstractSequence
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.opening import open_sequence
 from modeler.sequences.survey import survey
@@ -42,7 +42,7 @@ class WatchLimits:
 
 @final
 @dataclass(frozen=True)
-class WatchedSequence(AbstractDerived):
+class WatchedSequence(AbstractLive, AbstractDerived):
     """The frames in a folder, and those that will come, each once it is complete.
 
     `indices`, `name` and the rest keep their values from when the sequence was opened.
@@ -54,23 +54,12 @@ class WatchedSequence(AbstractDerived):
     """Values that take precedence over the files."""
     patience: WatchLimits = field(default_factory=WatchLimits)
     """How long to wait."""
-    every: int = 1
-    """Stride over the frames."""
-    kept: slice = field(default_factory=lambda: slice(None, None))
-    """Keep these frame numbers."""
-    stop: Callable[[], bool] = lambda: False
-    """Polled while waiting; true ends the sequence."""
 
     @property
     def indices(self) -> tuple[int, ...]:
         """Numbers of the frames that have arrived."""
         wanted = [index for index in self.whole.indices if self._wants(index)]
         return tuple(wanted[:: self.every])
-
-    @property
-    def live(self) -> bool:
-        """True: more frames come."""
-        return True
 
     def recorded(self) -> AbstractSequence:
         """Return the frames that existed when it was opened."""
@@ -91,19 +80,6 @@ class WatchedSequence(AbstractDerived):
             wanted += 1
             if wanted % self.every == 0:
                 yield frame
-
-    def until(self, stop: Callable[[], bool]) -> WatchedSequence:
-        """Return the sequence that ends when it is asked to."""
-        return replace(self, stop=stop)
-
-    def select(self, every: int = 1, frames: slice | None = None) -> WatchedSequence:
-        """Return a part of the sequence, of present and future frames.
-
-        Raises:
-            InputError: if `every` keeps nothing.
-        """
-        check_every(every)
-        return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
 
     @property
     def layout(self) -> str:
@@ -203,13 +179,8 @@ class _Looks:
     """Looks at a folder and at the folders in it, which cost no more than the names of files that are complete."""
 
     def __init__(self, path: Path, settle_s: float) -> None:
-        """Begin with a folder that was never looked at.
-
-        Args:
-            path: the folder.
-            settle_s: a file in one of its folders is complete once it has not changed for so long.
-        """
-        self._path, self._settle_s = path, settle_s
+        self._path = path
+        self._settle_s = settle_s  # a file in one of its folders is complete once it has not changed for so long
         self._complete: dict[str, set[str]] = {}  # names by folder
         self._newer: dict[str, tuple[object, float]] = {}  # state, and since when it has it, by path
 

@@ -24,13 +24,13 @@ from modeler.sequences.rendering.labels import (
     Spherical,
     Unwrapped,
     gamma_coded,
-    linear_light,
 )
 from modeler.sequences.rendering.photography import Lamp, Photography, SmoothNormals
 from modeler.sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import AnyShape, Box, Cylinder, MeshFile, Sphere
 from modeler.sequences.rendering.trajectory import Place, Places
+from modeler.system.pictures import linear_light
 from modeler.types import Array, InputError
 
 VIEW = Viewpoint(160, 120, 287.5, 0.6, look_height_m=0.05)

@@ -17,7 +17,7 @@ from modeler.export.files import write_atomically
 from modeler.export.formats import mesh_ply
 from modeler.export.placing import CAMERA_AXES
 from modeler.system.extras import check_installed
-from modeler.system.pictures import encoded, raycaster, tensor
+from modeler.system.pictures import encoded, linear_light, raycaster, tensor
 from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl", ".3mf")
@@ -169,9 +169,8 @@ def _with_colours(tree: dict[str, Any]) -> None:
 
 
 def linear_rgb(colours: npt.NDArray[np.uint8]) -> Array:
-    """Return linear intensities (n, 3), 0 to 1, of sRGB colours (n, 3) (IEC 61966-2-1)."""
-    shares = colours / 255.0
-    return np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    """Return linear intensities (n, 3), 0 to 1, of sRGB colours (n, 3) from 0 to 255."""
+    return linear_light(colours / 255.0)
 
 
 def _3mf(model: ObjectModel, unit: Literal["m", "mm"]) -> bytes:

@@ -23,6 +23,11 @@ def encoded(pixels: npt.NDArray[Any], kind: Literal["PNG", "JPEG"], **options: A
     return buffer.getvalue()
 
 
+def linear_light(srgb: npt.NDArray[np.floating]) -> Array:
+    """Return sRGB values of any shape, 0 to 1, in proportion to light (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
 def tensor(values: npt.NDArray[Any]) -> o3d.core.Tensor:
     """Return an array of any shape as Open3D's numbers of 32 bits."""
     import open3d as o3d  # takes a second to import

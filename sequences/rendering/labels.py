@@ -14,6 +14,7 @@ from PIL import Image
 
 from modeler.sequences.image_files import read_colour
 from modeler.sequences.meshes import IntArray, Mesh
+from modeler.system.pictures import linear_light
 from modeler.types import Array, BoolArray, Float32Array, InputError
 
 STEEP = np.sqrt(0.5)
@@ -215,11 +216,6 @@ _FINE = 2
 """Number of pixels per texel along each side when prints are drawn."""
 LARGEST_PX = 4096
 """Images are at most this wide and high."""
-
-
-def linear_light(srgb: npt.NDArray[np.floating]) -> Array:
-    """Return sRGB values, 0 to 1, in proportion to light (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 def gamma_coded(light: Array) -> Array:

@@ -12,8 +12,9 @@ from scipy.sparse import coo_array
 
 from modeler import se3
 from modeler.sequences.meshes import IntArray, Mesh
-from modeler.sequences.rendering.labels import LabelledMesh, Surfels, gamma_coded, linear_light
+from modeler.sequences.rendering.labels import LabelledMesh, Surfels, gamma_coded
 from modeler.sequences.rendering.meshes import Hits
+from modeler.system.pictures import linear_light
 from modeler.types import Array, BoolArray
 
 _CREASE = np.cos(np.radians(30.0))

@@ -188,13 +188,6 @@ class RosSequence(AbstractStreams[Stamp]):
     """Millimetres per unit of 16-bit depth."""
     unit: str
     """The unit, for people."""
-    by_maker: bool = True
-    """Whether the intrinsics are of camera_info, not the user's."""
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the intrinsics are of a calibration of this camera."""
-        return self.by_maker
 
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
         """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
@@ -250,8 +243,8 @@ def open_ros(path: Path, overrides: Overrides) -> RosSequence:
     if not times:
         raise InputError(f"{path}: holds no message of {depth_topic}; record it again.")
     pairs, unpaired = paired(times, [] if colour is None else _times(bag, colour.topic))
-    left = (*left, *unpaired)
-    return RosSequence(path, lens, pairs, left, bag, depth_topic, colour, unit_mm, unit, overrides.intrinsics is None)
+    about = {"remarks": (*left, *unpaired), "calibrated": overrides.intrinsics is None}
+    return RosSequence(path, lens, pairs, bag, depth_topic, colour, unit_mm, unit, **about)
 
 
 def _times(bag: Bag, topic: str) -> list[tuple[float, Stamp]]:
