@@ -1,14 +1,19 @@
-"""Folders of depth and colour images: Open3D, BundleSDF and similar layouts."""
+"""Folders of depth and colour images, or with a video of colour: Open3D, BundleSDF, Stray Scanner and others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import importlib
+import importlib.util
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler import se3
 from modeler.sequences.depth_files import (
@@ -25,6 +30,7 @@ from modeler.sequences.file_names import frame_numbers, partners, role_of, said_
 from modeler.sequences.image_files import (
     COLOUR_SUFFIXES,
     MASK_SUFFIXES,
+    MAX_PIXELS,
     check_size,
     graded,
     image_size,
@@ -39,6 +45,7 @@ from modeler.sequences.input_files import (
     entries,
     first_folder,
     frame_number,
+    input_errors,
     is_there,
     list_images,
     read_text,
@@ -46,9 +53,53 @@ from modeler.sequences.input_files import (
 from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, cameras_of_frames, find_intrinsics
 from modeler.sequences.lens import Lens
 from modeler.sequences.recording import AbstractRecording
-from modeler.sequences.video import Video, can_decode
-from modeler.system.extras import install_command
+from modeler.system.processes import install_command
+from modeler.system.regular_files import check_regular
 from modeler.types import Array, Camera, Frame, InputError
+
+
+def can_decode() -> bool:
+    """Return whether the library that decodes videos is installed."""
+    return importlib.util.find_spec("av") is not None
+
+
+@final
+class Video:
+    """A video whose images are read one after the other: to go back is to begin again."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock, self._next = threading.Lock(), 0
+        self._images: Iterator[Any] = iter(())
+
+    def image(self, number: int) -> npt.NDArray[np.uint8] | None:
+        """Return an image, counted from 0, as RGB (h, w, 3); None if the video ends before it.
+
+        Raises:
+            InputError: if it cannot be decoded.
+        """
+        with self._lock, input_errors(self.path, "video", "record it again"):
+            if number < self._next or self._next == 0:
+                self._container.seek(0)
+                self._next, self._images = 0, self._container.decode(video=0)
+            for image in self._images:
+                self._next += 1
+                if self._next > number:
+                    return np.asarray(image.to_ndarray(format="rgb24"), dtype=np.uint8)
+        return None
+
+    @cached_property
+    def _container(self) -> Any:
+        """Return the open file; it is closed when this video is forgotten."""
+        av = importlib.import_module("av")
+        check_regular(self.path)
+        container = av.open(str(self.path), mode="r")
+        weakref.finalize(self, container.close)
+        (track, *_) = container.streams.video
+        if not 0 < track.width * track.height <= MAX_PIXELS:
+            raise InputError(f"{self.path}: has {track.width} x {track.height} pixels; record it again.")
+        track.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+        return container
 
 
 @final

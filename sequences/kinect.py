@@ -21,7 +21,7 @@ from modeler.sequences.input_files import Node, input_errors
 from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
 from modeler.sequences.lens import Alignment, Lens, coefficients
 from modeler.sequences.recording import AbstractStreams, paired
-from modeler.system.extras import install_command
+from modeler.system.processes import install_command
 from modeler.system.regular_files import check_regular
 from modeler.types import Array, Camera, InputError
 

@@ -16,7 +16,7 @@ from modeler.sequences.base import AbstractLive, AbstractSequence, span
 from modeler.sequences.depth_files import metres
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens, coefficients
-from modeler.system.extras import install_command
+from modeler.system.processes import install_command
 from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, Camera, Frame, InputError, SensorNoise
 
 FIRST = 10

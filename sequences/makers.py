@@ -15,7 +15,7 @@ import numpy as np
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens
 from modeler.sequences.live import TIMEOUT_MS, Image, LiveSequence, RunningCamera, in_a_line, opened
-from modeler.system.extras import install_command
+from modeler.system.processes import install_command
 from modeler.types import Camera, InputError
 
 _OAK_PX: Final = (640, 400)  # width and height of depth and colour: stereo of all models gives as many

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from modeler.sequences.base import AbstractSequence
 from modeler.sequences.bop import BopSequence
+from modeler.sequences.calibrated import AxialSequence
 from modeler.sequences.clouds import SUFFIXES as CLOUD_SUFFIXES
 from modeler.sequences.clouds import open_clouds
 from modeler.sequences.hand_shapes import with_hand
@@ -23,7 +24,6 @@ from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import SCHEME, open_camera
 from modeler.sequences.makers import LIBRARIES, open_camera_of
 from modeler.sequences.phones import images_of_transforms, open_record3d
-from modeler.sequences.ray_distance import AxialSequence
 from modeler.sequences.tum import open_tum
 from modeler.system.regular_files import check_regular
 from modeler.types import InputError

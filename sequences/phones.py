@@ -18,7 +18,7 @@ from modeler.sequences.image_folders import FoundImages
 from modeler.sequences.input_files import Node, input_errors, is_there, listed, read_tree
 from modeler.sequences.intrinsics import Overrides, camera_of
 from modeler.sequences.recording import AbstractRecording
-from modeler.system.extras import install_command
+from modeler.system.processes import install_command
 from modeler.system.regular_files import open_regular, parse_json
 from modeler.types import Camera, Frame, InputError
 

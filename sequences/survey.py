@@ -1,17 +1,20 @@
-"""Inspection of all frames: contents, missing data, and implausible values."""
+"""Inspection of all frames: contents, missing data, implausible values, and a picture of some."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
+from PIL import Image
 
 from modeler.sequences.base import AbstractSequence, span
-from modeler.sequences.colour_alignment import Misalignment, misalignment
-from modeler.sequences.ray_distance import flat_shares
+from modeler.sequences.calibrated import flat_shares
+from modeler.sequences.colour_alignment import Misalignment, depth_edges, misalignment
 from modeler.types import Camera, Float32Array, Frame, InputError
 
 NEAREST_M = 0.01
@@ -335,3 +338,47 @@ def _on_colour(found: Misalignment) -> str:
 
 def _some(numbers: tuple[int, ...]) -> str:
     return ", ".join(map(str, numbers)) if len(numbers) <= 5 else span(numbers)
+
+
+_EDGE = (255, 0, 0)
+_NEAR, _FAR = np.array([255.0, 220.0, 120.0]), np.array([30.0, 40.0, 110.0])
+_GAP = 4
+
+
+def write_picture(path: Path, frames: Sequence[Frame]) -> None:
+    """Write a PNG with a row a frame: depth from near (light) to far (dark), colour or depth with edges, the mask.
+
+    Raises:
+        InputError: if it cannot be written.
+    """
+    rows = [np.concatenate([np.pad(image, _PAD) for image in _images(frame)], axis=1) for frame in frames]
+    width = max(row.shape[1] for row in rows)
+    whole = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
+    try:
+        Image.fromarray(whole).save(path, "PNG")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None
+
+
+_PAD = ((0, _GAP), (0, _GAP), (0, 0))
+
+
+def _images(frame: Frame) -> list[npt.NDArray[np.uint8]]:
+    """Return the images (h, w, 3) of a row."""
+    depth = _shaded(frame)
+    over = (depth if frame.colour is None else frame.colour).copy()
+    over[depth_edges(frame.depth_m)] = _EDGE
+    if frame.mask is None:
+        return [depth, over]
+    return [depth, over, np.where(frame.mask[..., None], depth, depth // 4).astype(np.uint8)]
+
+
+def _shaded(frame: Frame) -> npt.NDArray[np.uint8]:
+    """Return depth as an image (h, w, 3), black where nothing was measured."""
+    measured = measured_pixels(frame)
+    image = np.zeros((*frame.depth_m.shape, 3), np.uint8)
+    if measured.any():
+        near, far = np.percentile(frame.depth_m[measured], (1.0, 99.0))
+        share = np.clip((frame.depth_m[measured] - near) / max(far - near, 1e-6), 0.0, 1.0)[:, None]
+        image[measured] = (_NEAR + share * (_FAR - _NEAR)).astype(np.uint8)
+    return image

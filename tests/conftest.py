@@ -26,8 +26,8 @@ from turning_box import COUNT, LOST, steps
 
 from modeler.cli import main
 from modeler.sequences import bundled, write_bop
+from modeler.sequences.calibrated import flat_shares
 from modeler.sequences.colour_alignment import misalignment
-from modeler.sequences.ray_distance import flat_shares
 from modeler.system import concurrency
 from modeler.types import Frame, Step
 from studies.formats.image_folders import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum

@@ -20,7 +20,7 @@ from modeler.baselines import (
     GicpRegistrar,
     IcpRegistrar,
     KissIcpRegistrar,
-    kiss,
+    fpfh,
 )
 from modeler.baselines.clouds import (
     Cloud,
@@ -33,7 +33,7 @@ from modeler.baselines.clouds import (
     start,
     whitened_jacobian,
 )
-from modeler.baselines.coloured_icp import intensity_gradients
+from modeler.baselines.icp import intensity_gradients
 from modeler.experiment import sparse_view
 from modeler.priors import GeneralPrior
 from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
@@ -383,7 +383,7 @@ def test_sparse_clouds_are_registered_by_the_levels_that_they_allow(pair: Pair, 
     assert found.outcome is Outcome.TOO_FEW_POINTS
 
 
-@pytest.mark.skipif(not kiss.installed(), reason="KISS-Matcher is not installed")
+@pytest.mark.skipif(not fpfh.kiss_installed(), reason="KISS-Matcher is not installed")
 def test_kiss_finds_any_motion_of_a_body_with_features(rng: np.random.Generator) -> None:
     """A bumpy ball of 4 cm, smaller than the cubes that KISS-Matcher is made for, turned by 140°; twice the same."""
     directions = rng.normal(size=(20_000, 3))

@@ -17,7 +17,7 @@ import trimesh
 from command_runner import BOX, FILES, Run
 
 from modeler import priors, se3
-from modeler.baselines import kiss
+from modeler.baselines import fpfh
 from modeler.cli import main
 from modeler.cli.console import Interrupt
 from modeler.composition import compose
@@ -274,7 +274,7 @@ def test_coloured_icp_refuses_what_has_no_colour(cli: Run, tmp_path: Path, argum
 def test_kiss_is_refused_where_it_is_not_installed(
     cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...]
 ) -> None:
-    monkeypatch.setattr(kiss, "installed", lambda: False)
+    monkeypatch.setattr(fpfh, "kiss_installed", lambda: False)
     named = ("--methods", "kiss", "--out", tmp_path / "out") if arguments[0] == "evaluate" else ("--method", "kiss")
     ended = cli(*arguments, *named)
     assert (ended.status, ended.out) == (2, "")

@@ -15,7 +15,7 @@ from PIL import Image
 from modeler.cli import main
 from modeler.cli.info import of_the_scene
 from modeler.sequences import Overrides, Survey, bundled, open_sequence, survey, write_bop
-from modeler.sequences.ray_distance import AxialSequence, stretch
+from modeler.sequences.calibrated import AxialSequence, stretch
 from modeler.sequences.ros.messages import from_rvl
 from modeler.types import Camera, Frame, InputError
 from studies.formats.image_folders import raw_depth, save

@@ -241,9 +241,9 @@ def test_a_database_computes_nothing(
 def test_a_database_that_takes_too_long_is_one_line(
     tmp_path: Path, frames: list[Frame], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("modeler.sequences.ros.database._STEP", 10)
-    monkeypatch.setattr("modeler.sequences.ros.database._STEPS", 1)
-    monkeypatch.setattr("modeler.sequences.ros.database._STEPS_PER_BYTE", 0.0)
+    monkeypatch.setattr("modeler.sequences.ros.bag._STEP", 10)
+    monkeypatch.setattr("modeler.sequences.ros.bag._STEPS", 1)
+    monkeypatch.setattr("modeler.sequences.ros.bag._STEPS_PER_BYTE", 0.0)
     assert "interrupted" in fails(Recorder().write(tmp_path / "s.db3", frames), capsys).lower()
 
 

@@ -22,7 +22,7 @@ from modeler.tracking import ModelRenderer, Tracked, Tracker
 from modeler.tracking.errors import of_the_camera, of_the_model
 from modeler.types import Array, Camera, Frame, InputError, ObjectModel, PoseGaussian
 from modeler.views import Sensor
-from modeler.views.thinning import thinned
+from modeler.views.rays import thinned
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, staged
 from studies.tracking.clutter import model_of as model_on_table

@@ -31,16 +31,13 @@ from modeler.cli.batch import Batch
 from modeler.cli.build import Build
 from modeler.cli.calibrate import CalibrateCamera, CalibrateSensor
 from modeler.cli.console import INTERRUPTED, endable, say, worded_as_options
-from modeler.cli.convert import Convert
-from modeler.cli.edit import Edit
+from modeler.cli.convert import Convert, Render
+from modeler.cli.edit import Edit, Join
 from modeler.cli.evaluate import Evaluate
 from modeler.cli.export import Export
 from modeler.cli.info import Info
-from modeler.cli.join import Join
-from modeler.cli.pages import Gallery, Report, View
+from modeler.cli.pages import Gallery, Report, Studio, View
 from modeler.cli.register import Register
-from modeler.cli.render import Render
-from modeler.cli.studio import Studio
 from modeler.cli.suggest import Suggest
 from modeler.cli.track import Track
 from modeler.system.processes import check_room, share_one_heap

@@ -68,10 +68,9 @@ class Batch:
             InputError: if options, the manifest, the engine or the folder cannot be used.
             KeyboardInterrupt: after the finished sequences have been listed.
         """
-        from modeler.batch.engines import check_engine, is_here
+        from modeler.batch.engines import check_engine, is_here, results
         from modeler.batch.jobs import ended, read_note, standing
         from modeler.batch.models import write_models
-        from modeler.batch.work import results
         from modeler.export import locked
         from modeler.runs.compiling import compile_kernels
         from modeler.runs.outputs import check_folder

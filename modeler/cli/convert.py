@@ -1,9 +1,9 @@
-"""`modeler convert`: any input to the native layout, and results to other programs' formats."""
+"""`modeler convert` and `modeler render`: any input or a recipe as a sequence, and results for other programs."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +11,7 @@ import tyro
 
 from modeler.cli.console import say
 from modeler.cli.options import FrameOptions, InputOptions
-from modeler.composition.options import default
+from modeler.composition.options import SEED, default
 
 
 @dataclass(frozen=True)
@@ -106,3 +106,28 @@ def _poses(run: Path, out: Path) -> int:
         raise InputError(f"{out}: poses are written as scene_gt.json (BOP) or .txt (TUM); give --out such a name.")
     say(f"{len(poses)} poses: {out}")
     return 0
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a synthetic sequence, with its ground truth, from a recipe."""
+
+    recipe: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RECIPE")]
+    """Recipe in JSON or TOML, or the name of a built-in one: box, flashlight, tube and more."""
+    out: Annotated[Path, tyro.conf.arg(metavar="SEQUENCE")]
+    """BOP scene folder to create."""
+    seed: Annotated[int | None, SEED, default("the recipe's own")] = None
+    """Seed of the camera's noise and of the object's motion."""
+
+    def run(self) -> int:
+        """Render the sequence."""
+        from modeler.cli.reading import reading
+        from modeler.runs.outputs import check_folder
+        from modeler.sequences.rendering.recipe import load_recipe
+        from modeler.sequences.rendering.renderer import render
+
+        check_folder(self.out, [Path(self.recipe)])
+        recipe = load_recipe(self.recipe)
+        with reading() as watched:
+            render(recipe if self.seed is None else replace(recipe, seed=self.seed), self.out, watched)
+        return 0

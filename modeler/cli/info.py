@@ -44,7 +44,7 @@ class Info:
         from modeler.cli.reading import reading
         from modeler.runs.outputs import check_files
         from modeler.sequences import open_sequence, survey
-        from modeler.sequences.survey_picture import write_picture
+        from modeler.sequences.survey import write_picture
 
         if self.picture is not None:
             check_files([self.picture], [self.input], overwrite=True)

@@ -128,7 +128,7 @@ class Track:
         """Track the object through frames, write and show it."""
         from modeler.cli.reading import reading, while_it_lasts
         from modeler.runs.tracks import PAGE
-        from modeler.viz import blueprint, tracking_view
+        from modeler.viz import blueprint, model_view
         from modeler.viz.report.track import write_track_page
         from modeler.viz.stream import open_stream
 
@@ -138,14 +138,14 @@ class Track:
         found: list[Tracked] = []
         try:
             stream.lay_out(blueprint.tracking_layout(None))
-            stream.draw_at(None, tracking_view.draw_tracked_model(tracker.model))
+            stream.draw_at(None, model_view.draw_tracked_model(tracker.model))
             with Interrupt() as interrupt, reading() as watched:
                 shown = watched(frames, "tracking").until(lambda: interrupt.asked)
                 for frame in interrupt.until(while_it_lasts(shown) if frames.live else shown):
                     found.append(tracker.update(frame))
                     if found[-1].pose is not None and sum(one.pose is not None for one in found) == 1:
                         stream.lay_out(blueprint.tracking_layout(found[-1].view))
-                    stream.draw_at(frame.index, tracking_view.draw_tracked(frame, found[-1], tracker.renderer))
+                    stream.draw_at(frame.index, model_view.draw_tracked(frame, found[-1], tracker.renderer))
                     folder.write(found)
                     found[-1] = replace(found[-1], view=None)  # which a long track would not hold
         finally:

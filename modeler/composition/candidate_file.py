@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.priors import HeldPrior
 from modeler.priors import Poke as Push
-from modeler.sequences.input_files import Node, read_text, read_tree
-from modeler.sequences.typed_files import build
+from modeler.sequences.input_files import Node, build, read_text, read_tree
 from modeler.suggestion import Candidate
 from modeler.types import Array, InputError
 

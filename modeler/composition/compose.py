@@ -13,7 +13,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, Literal
 
 from modeler import baselines, registration
-from modeler.baselines import kiss
+from modeler.baselines import fpfh
 from modeler.closure import Closer
 from modeler.composition.options import Method, MethodOptions, ObjectOptions, PriorOptions
 from modeler.fusion import Fuser
@@ -147,8 +147,8 @@ def registrar(
         case "fpfh-icp":
             return baselines.FpfhIcpRegistrar()
         case "kiss":
-            if not kiss.installed():
-                raise InputError(f"`method` kiss: {kiss.MISSING}")
+            if not fpfh.kiss_installed():
+                raise InputError(f"`method` kiss: {fpfh.KISS_MISSING}")
             return baselines.KissIcpRegistrar()
 
 

@@ -16,8 +16,8 @@ from scipy.spatial import KDTree
 from modeler.export.files import write_atomically
 from modeler.export.formats import mesh_ply
 from modeler.export.placing import CAMERA_AXES
-from modeler.system.extras import check_installed
 from modeler.system.pictures import encoded, linear_light, raycaster, tensor
+from modeler.system.processes import check_installed
 from modeler.types import Array, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl", ".3mf")

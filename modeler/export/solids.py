@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from modeler.export.files import write_atomically
 from modeler.export.mesh import simplified
-from modeler.system.extras import install_command
+from modeler.system.processes import install_command
 from modeler.types import Array, InputError, ObjectModel
 
 HULL_TRIANGLES = 500

@@ -31,8 +31,8 @@ from modeler.runs.checks import Checks, loaded, mesh_checks
 from modeler.runs.outputs import check_files, check_folder, run_inputs
 from modeler.runs.reopening import Reopened, reopened
 from modeler.sequences import finest_unit_mm, write_bop
-from modeler.system.extras import check_installed
 from modeler.system.pictures import encoded
+from modeler.system.processes import check_installed
 from modeler.types import Array, InputError, ObjectModel
 
 _MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}

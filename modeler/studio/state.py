@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import final
 
 from modeler.sequences import open_sequence
-from modeler.studio.capture import IDLE_S, Capture
+from modeler.studio.capture import IDLE_S, Capture, Recorder
 from modeler.studio.jobs import Job, Queue
-from modeler.studio.recorder import Recorder
 from modeler.studio.scan import STATE, Choices, Scan, next_run, page_job
 from modeler.types import InputError
 

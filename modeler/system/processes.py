@@ -1,11 +1,15 @@
-"""Processes: address space required by libraries, one heap for all threads, and where child processes find modules."""
+"""Processes: address space, one heap for all threads, where children find modules; and optional packages."""
 
 from __future__ import annotations
 
 import ctypes
+import importlib.util
 import mmap
 import os
+import shlex
 import sys
+
+from modeler.types import InputError
 
 _M_ARENA_MAX = -8  # of mallopt(3)
 
@@ -36,3 +40,18 @@ def check_room(size: int) -> None:
 def environment() -> dict[str, str]:
     """Return the environment in which Python finds the modules of this process, and none in the current folder."""
     return {**os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra for the interpreter that runs, of a clone and of a package alike."""
+    return f"{shlex.quote(sys.executable)} -m pip install 'modeler[{extra}]'"
+
+
+def check_installed(module: str, package: str, extra: str) -> None:
+    """Reject work that needs a package that is not installed.
+
+    Raises:
+        InputError: if it is not installed.
+    """
+    if importlib.util.find_spec(module) is None:
+        raise InputError(f"{package} is not installed; {install_command(extra)}")

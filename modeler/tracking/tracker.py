@@ -41,7 +41,7 @@ from modeler.types import (
     pooled,
 )
 from modeler.views import Sensor
-from modeler.views.thinning import thinned
+from modeler.views.rays import thinned
 
 Presence = Literal["found", "followed", "unsure", "not there", "too few points"]
 

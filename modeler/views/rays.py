@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
 
 from modeler.kernels import planes
-from modeler.types import BoolArray, Frame, Plane, RayImage, SensorNoise
+from modeler.types import BoolArray, Camera, Frame, Plane, RayImage, SensorNoise
 from modeler.views.range_noise import RangeNoise
 from modeler.views.sparsity import ON_PLANE, closed, gap_px, measured_share, nearest_depth
 
@@ -219,3 +221,39 @@ def _drawn_plane(plane: Plane, factor: float) -> Plane:
     drawn = plane.normal * (factor, factor, 1.0)
     length = float(np.linalg.norm(drawn))
     return replace(plane, normal=drawn / length, offset_m=plane.offset_m / length)
+
+
+def thinned(frame: Frame, sensor: Sensor, step: int) -> tuple[Frame, Sensor]:
+    """Return a frame at every `step`-th pixel in both directions, and its sensor.
+
+    Depth is kept as measured, as means of pixels would bridge edges; colours are blurred as by means over `step` px.
+    """
+    if step == 1:
+        return frame, sensor
+    start = (step - 1) // 2  # the middle of a square of `step` px
+    kept = (slice(start, None, step), slice(start, None, step))
+    depth_m, camera = np.ascontiguousarray(frame.depth_m[kept]), frame.camera
+    colour: npt.NDArray[np.uint8] | None = None
+    if frame.colour is not None:
+        sigma_px = math.sqrt((step**2 - 1) / 12.0)
+        colour = np.empty_like(frame.colour)
+        ndimage.gaussian_filter(frame.colour, (sigma_px, sigma_px, 0.0), output=colour, truncate=2.0)
+        colour = np.ascontiguousarray(colour[kept])
+    small = Frame(
+        frame.index,
+        frame.time_s,
+        depth_m,
+        Camera(
+            depth_m.shape[1],
+            depth_m.shape[0],
+            camera.fx / step,
+            camera.fy / step,
+            (camera.cx - start) / step,
+            (camera.cy - start) / step,
+        ),
+        None if frame.mask is None else np.ascontiguousarray(frame.mask[kept]),
+        colour,
+        None if frame.occluder is None else np.ascontiguousarray(frame.occluder[kept]),
+    )
+    noise = sensor.noise._replace(sigma_colour_px=sensor.noise.sigma_colour_px / step)
+    return small, replace(sensor, noise=noise, noise_area_px=sensor.noise_area_px / step**2)

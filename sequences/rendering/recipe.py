@@ -8,13 +8,12 @@ from typing import Literal, final
 
 import numpy as np
 
-from modeler.sequences.input_files import read_tree
+from modeler.sequences.input_files import build, read_tree
 from modeler.sequences.rendering.depth_sensor import DepthSensor
 from modeler.sequences.rendering.labels import Label
 from modeler.sequences.rendering.photography import Photography
 from modeler.sequences.rendering.shapes import AnyShape
 from modeler.sequences.rendering.trajectory import AnyTrajectory, Tabletop
-from modeler.sequences.typed_files import build
 from modeler.types import Array, Camera, InputError
 
 

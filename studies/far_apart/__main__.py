@@ -21,7 +21,7 @@ from typing import Final, final, get_args
 
 import numpy as np
 
-from modeler.baselines import FpfhIcpRegistrar, KissIcpRegistrar, kiss
+from modeler.baselines import FpfhIcpRegistrar, KissIcpRegistrar, fpfh
 from modeler.evaluation import rotation_error_deg
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
@@ -82,7 +82,7 @@ def _trials(pair: Pair, limits: Iterable[Limits], seed: tuple[int, int], *, colo
     if "default" in limits:
         methods["visibility, default"] = partial(untold.register, pair.source, pair.target)
     methods["fpfh-icp"] = partial(by, FpfhIcpRegistrar(), "none")
-    if kiss.installed():
+    if fpfh.kiss_installed():
         methods["kiss"] = partial(by, KissIcpRegistrar(), "none")
     for method, register in methods.items():
         began_s = time.process_time()
