@@ -1,4 +1,7 @@
-"""Readers of depth-camera sequences, and the renderer that makes synthetic ones."""
+"""Readers of depth-camera sequences, and the renderer that makes synthetic ones.
+
+Whatever reads raises `InputError`, in one line, where it cannot; docstrings within the package do not repeat it.
+"""
 
 from pathlib import Path
 

@@ -36,11 +36,7 @@ from modeler.types import Array, BoolArray, Camera, Frame, InputError
 
 
 def intrinsics(node: Node) -> Intrinsics:
-    """Return (fx, fy, cx, cy) in px of one entry of `scene_camera.json`.
-
-    Raises:
-        InputError: if `cam_K` is missing or is not the matrix of a pinhole camera.
-    """
+    """Return (fx, fy, cx, cy) in px of one entry of `scene_camera.json`."""
     entry = node.need("cam_K")
     found = of_matrix(entry.numbers(9).reshape(3, 3))
     if found is None:
@@ -49,20 +45,12 @@ def intrinsics(node: Node) -> Intrinsics:
 
 
 def depth_scale_mm(node: Node) -> float:
-    """Return the millimetres per unit of depth of one entry of `scene_camera.json`.
-
-    Raises:
-        InputError: if it is missing or absurd; 1000 would be units per metre mistaken for it.
-    """
+    """Return the millimetres per unit of depth of one entry of `scene_camera.json`."""
     return node.need("depth_scale").number(1e-6, 100.0)
 
 
 def camera_from_model(node: Node) -> Array:
-    """Return the pose (4, 4), in m, of one object of `scene_gt.json`.
-
-    Raises:
-        InputError: if rotation or translation is missing or not valid.
-    """
+    """Return the pose (4, 4), in m, of one object of `scene_gt.json`."""
     entry = node.need("cam_R_m2c")
     written = entry.numbers(9).reshape(3, 3)
     if np.abs(written).max() > 2.0:
@@ -105,11 +93,7 @@ class BopSequence(AbstractRecording):
     """Values that take precedence over the files."""
 
     def __post_init__(self) -> None:
-        """Check everything that can be checked without decoding an image.
-
-        Raises:
-            InputError: if the folder is no readable scene.
-        """
+        """Check everything that can be checked without decoding an image."""
         _ = self._depth_paths, self._intrinsics, self._times_s, self.name, self.sensor(), self.motion
 
     @property

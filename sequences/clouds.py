@@ -109,11 +109,7 @@ _SAID: Final[Mapping[Axes, tuple[str, ...]]] = {
 
 
 def open_clouds(path: Path, overrides: Overrides) -> CloudSequence:
-    """Open a folder of clouds, or one such file.
-
-    Raises:
-        InputError: if it is not readable as such, or the camera that saw the points is not known.
-    """
+    """Open a folder of clouds, or one such file."""
     found = list_images(path, SUFFIXES) if path.is_dir() else {path.stem: path}
     numbers = frame_numbers(list(found)) or {stem: place for place, stem in enumerate(found)}
     clouds = dict(sorted((numbers[stem], cloud) for stem, cloud in found.items()))
@@ -280,11 +276,7 @@ def _window(
 
 
 def organised(path: Path) -> tuple[int, int]:
-    """Return the (width, height) of a cloud as its header says; one row if it is not organised as an image.
-
-    Raises:
-        InputError: if it is no cloud.
-    """
+    """Return the (width, height) of a cloud as its header says; one row if it is not organised as an image."""
     try:
         with open_regular(path) as file:
             head, size = file.read(_HEADER_BYTES), os.fstat(file.fileno()).st_size
@@ -321,11 +313,7 @@ _PLY_SIZES = ("num_cols|width|cols", "num_rows|height|rows")
 
 
 def fit_intrinsics(points: npt.NDArray[np.float64], path: Path) -> Intrinsics:
-    """Return the intrinsics of the camera that saw points (h, w, 3), by least squares over all of them.
-
-    Raises:
-        InputError: if no pinhole camera that looks along z saw them.
-    """
+    """Return the intrinsics of the camera that saw points (h, w, 3), by least squares over all of them."""
     rows, columns = np.indices(points.shape[:2])
     return _fitted(points.reshape(-1, 3), np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64), path)
 

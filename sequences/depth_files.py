@@ -30,11 +30,7 @@ _WANTED: Final = "depth must be a 16-bit greyscale PNG, TIFF or PGM image, or fl
 
 
 def read_depth(path: Path | EmbeddedImage) -> RawDepth:
-    """Return a depth image (h, w) as stored.
-
-    Raises:
-        InputError: if the file is missing, broken, too large or no depth image.
-    """
+    """Return a depth image (h, w) as stored."""
     suffix = path.suffix.lower() if isinstance(path, Path) else ""
     reader = {".pgm": _read_pgm, ".exr": _read_exr, ".npy": _read_npy, ".npz": _read_npz}.get(suffix)
     if reader is not None and isinstance(path, Path):
@@ -139,11 +135,7 @@ def _read_exr(file: BinaryIO) -> npt.NDArray[np.generic]:
 
 
 def depth_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of a depth image.
-
-    Raises:
-        InputError: if the file is missing or no image.
-    """
+    """Return (width, height) of a depth image."""
     if path.suffix.lower() in (".png", ".tif", ".tiff"):
         return image_size(path)
     height, width = read_depth(path).shape
@@ -196,11 +188,7 @@ def no_depth(folder: Path, wanted: str, formats: str = FORMATS) -> InputError:
 
 
 def check_same_size(path: Path, size: tuple[int, ...], alike: Path, said: str) -> None:
-    """Refuse a depth image of another size than one with the same intrinsics.
-
-    Raises:
-        InputError: if it is.
-    """
+    """Refuse a depth image of another size than one with the same intrinsics."""
     width, height = depth_size(alike)
     if size != (height, width):
         raise InputError(f"{path}: is {size[1]} x {size[0]} pixels where {alike.name} is {width} x {height}, {said}.")

@@ -109,9 +109,6 @@ def partners(
 
     Images belong together by name; by frame number; by the time stamps in their names, the nearest within half the
     time from one depth image to the next; or, of as many images, by order.
-
-    Raises:
-        InputError: if nothing matches them.
     """
     depth = list(depth)
     if not found:

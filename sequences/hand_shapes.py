@@ -96,11 +96,7 @@ class HandMarkedSequence(AbstractDerived):
 
 
 def with_hand(sequence: AbstractSequence) -> AbstractSequence:
-    """Return a sequence with the hand of its `sequence.json` masked; without one, the sequence itself.
-
-    Raises:
-        InputError: if the shape cannot be read, or the hand's poses are missing.
-    """
+    """Return a sequence with the hand of its `sequence.json` masked; without one, the sequence itself."""
     node = sequence.facts.get("hand") if isinstance(sequence, AbstractRecording) and sequence.facts else None
     if node is None:
         return sequence
@@ -114,11 +110,7 @@ def with_hand(sequence: AbstractSequence) -> AbstractSequence:
 
 
 def hand_poses(path: Path) -> HandPoses:
-    """Read the poses of a hand from its robot.txt.
-
-    Raises:
-        InputError: if it cannot be read, or holds no pose.
-    """
+    """Read the poses of a hand from its robot.txt."""
     poses = trajectory(path)
     if not poses:
         raise InputError(f"{path}: holds no pose; write lines `time tx ty tz qx qy qz qw`.")

@@ -43,11 +43,7 @@ class EmbeddedImage:
 
 
 def open_image(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Image:
-    """Return an image fully decoded.
-
-    Raises:
-        InputError: if it is missing, broken, too large or of none of the formats.
-    """
+    """Return an image fully decoded."""
     wanted = " or ".join(formats)
     try:
         with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
@@ -112,11 +108,7 @@ _STDERR = threading.Lock()
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of an image from its header.
-
-    Raises:
-        InputError: if the file is missing or no image.
-    """
+    """Return (width, height) of an image from its header."""
     try:
         with _stream(path) as stream, warnings.catch_warnings(), _unlogged():
             warnings.simplefilter("ignore")
@@ -129,11 +121,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> BoolArray:
-    """Return a mask (h, w), True where the image is not black. Of `read_labels`, occluders count too.
-
-    Raises:
-        InputError: if the file is missing, broken or too large.
-    """
+    """Return a mask (h, w), True where the image is not black. Of `read_labels`, occluders count too."""
     return read_labels(path) != 0
 
 
@@ -146,9 +134,6 @@ def read_labels(path: Path) -> npt.NDArray[np.uint8]:
 
     In images of few values, labels, all but 0 are object; of the many between black and white that soft edges, veils
     and JPEG make, those from the middle of the range on.
-
-    Raises:
-        InputError: if the file is missing, broken or too large.
     """
     pixels, is_grey = _mask_pixels(path)
     soft, few = is_soft(pixels), len(_values(pixels)) <= _FEW_LABELS
@@ -187,11 +172,7 @@ def _values(pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def graded(path: Path) -> bool:
-    """Return whether the mask in a file is graded between black and white.
-
-    Raises:
-        InputError: if the file is missing, broken or too large.
-    """
+    """Return whether the mask in a file is graded between black and white."""
     return is_soft(_mask_pixels(path)[0])
 
 
@@ -206,11 +187,7 @@ def object_and_occluder(
 
 
 def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:
-    """Return an image, in colour or grey, as RGB (h, w, 3).
-
-    Raises:
-        InputError: if the file is missing, broken or too large.
-    """
+    """Return an image, in colour or grey, as RGB (h, w, 3)."""
     image = open_image(path, _FORMATS)
     if image.mode.startswith("I"):  # 16-bit grey, which Pillow would clip rather than scale
         grey = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
@@ -228,11 +205,7 @@ def write_image(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint1
 
 
 def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> None:
-    """Refuse a mask or colour of another size than its depth image, each (h, w).
-
-    Raises:
-        InputError: if it is.
-    """
+    """Refuse a mask or colour of another size than its depth image, each (h, w)."""
     if found != depth:
         raise InputError(
             f"{path}: is {found[1]} x {found[0]} pixels where its depth image is {depth[1]} x {depth[0]}; "
@@ -241,11 +214,7 @@ def check_size(path: Path, found: tuple[int, ...], depth: tuple[int, ...]) -> No
 
 
 def resize_to_depth(path: Path, colour: npt.NDArray[np.uint8], depth: tuple[int, ...]) -> npt.NDArray[np.uint8]:
-    """Return colour (h, w, 3) in the size of its depth image, shrunk where it is finer and of the same shape.
-
-    Raises:
-        InputError: if it is of another shape, or coarser.
-    """
+    """Return colour (h, w, 3) in the size of its depth image, shrunk where it is finer and of the same shape."""
     height, width = depth
     if is_finer(colour.shape[1::-1], (width, height)):
         return np.array(Image.fromarray(colour).resize((width, height), Image.Resampling.BOX))

@@ -73,11 +73,7 @@ class Video:
         self._images: Iterator[Any] = iter(())
 
     def image(self, number: int) -> npt.NDArray[np.uint8] | None:
-        """Return an image, counted from 0, as RGB (h, w, 3); None if the video ends before it.
-
-        Raises:
-            InputError: if it cannot be decoded.
-        """
+        """Return an image, counted from 0, as RGB (h, w, 3); None if the video ends before it."""
         with self._lock, input_errors(self.path, "video", "record it again"):
             if number < self._next or self._next == 0:
                 self._container.seek(0)
@@ -246,11 +242,7 @@ class FoundImages:
 
 
 def images_in_folders(path: Path) -> FoundImages:
-    """Return the images in the folders `depth`, `rgb`, `masks` and others of such names.
-
-    Raises:
-        InputError: if there are no depth images.
-    """
+    """Return the images in the folders `depth`, `rgb`, `masks` and others of such names."""
 
     def within(names: tuple[str, ...], suffixes: tuple[str, ...]) -> dict[str, Path]:
         folder = first_folder(path, names)
@@ -298,9 +290,6 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
     """Open a folder with depth images and intrinsics, and where they are there, colour, masks and masks of hands.
 
     Depth of whole numbers is in mm unless the file of intrinsics or the user gives another unit.
-
-    Raises:
-        InputError: if it is not readable as such.
     """
     depth, first = found.depth, next(iter(found.depth.values()))
     size = depth_size(first)

@@ -24,11 +24,7 @@ from modeler.types import Array, InputError
 
 @contextmanager
 def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
-    """Turn exceptions of a library on a file into one line.
-
-    Raises:
-        InputError: in place of anything else.
-    """
+    """Turn exceptions of a library on a file into one line."""
     try:
         yield
     except (InputError, GeneratorExit):
@@ -49,11 +45,7 @@ def short_message(error: Exception, path: Path) -> str:
 
 
 def entries(folder: Path) -> list[Path]:
-    """Return the contents of a folder by name; nothing without such a folder.
-
-    Raises:
-        InputError: if it may not be read.
-    """
+    """Return the contents of a folder by name; nothing without such a folder."""
     try:
         return sorted(folder.iterdir(), key=lambda path: path.name)  # whole paths take ten times as long to compare
     except (FileNotFoundError, NotADirectoryError):
@@ -68,11 +60,7 @@ def is_there(path: Path) -> bool:
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
-    """Return the images of a folder by stem, without hidden files.
-
-    Raises:
-        InputError: if the folder may not be read, or two images share a name.
-    """
+    """Return the images of a folder by stem, without hidden files."""
     found: dict[str, Path] = {}
     for path in entries(folder):
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
@@ -89,22 +77,14 @@ def first_folder(root: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def check_link(path: Path, root: Path) -> None:
-    """Refuse a path that leads out of its sequence, by a link or by its name.
-
-    Raises:
-        InputError: if it does.
-    """
+    """Refuse a path that leads out of its sequence, by a link or by its name."""
     target, home = os.path.realpath(path), os.path.realpath(root)
     if os.path.commonpath([target, home]) != home:
         raise InputError(f"{path}: leads out of the sequence, to {target}; put the file itself there.")
 
 
 def listed(by: Path, name: str) -> Path:
-    """Return a file that a list in the same folder names.
-
-    Raises:
-        InputError: if it is not there, or its name leads out of the folder.
-    """
+    """Return a file that a list in the same folder names."""
     name = name.strip()
     if not name.isprintable():
         raise InputError(f"{by}: names a file with control characters; correct it there.")
@@ -117,11 +97,7 @@ def listed(by: Path, name: str) -> Path:
 
 
 def check_links(root: Path) -> None:
-    """Refuse a folder in which a link, at whatever depth, leads out of it, whether or not the link would be read.
-
-    Raises:
-        InputError: if one does, or a folder may not be read.
-    """
+    """Refuse a folder in which a link, at whatever depth, leads out of it, whether or not the link would be read."""
 
     def unreadable(error: OSError) -> None:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}); check its permissions.") from None
@@ -247,11 +223,7 @@ class Node:
 
 
 def read_tree(path: Path) -> Node:
-    """Parse a JSON file, or a TOML or YAML file by its suffix.
-
-    Raises:
-        InputError: if the file is missing or is not JSON, TOML or YAML.
-    """
+    """Parse a JSON file, or a TOML or YAML file by its suffix."""
     kind = {".toml": "TOML", ".yaml": "YAML", ".yml": "YAML"}.get(path.suffix.lower(), "JSON")
     text = read_text(path, kind)
     if kind == "JSON":
@@ -283,11 +255,7 @@ def _from_yaml(text: str) -> object:
 
 
 def read_text(path: Path, kind: str = "text") -> str:
-    """Return the text of a file of at most 64 MB.
-
-    Raises:
-        InputError: if it is no regular file, missing, larger, or not UTF-8.
-    """
+    """Return the text of a file of at most 64 MB."""
     try:
         return read_regular(path, MAX_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -301,9 +269,6 @@ def build(annotation: object, node: Node) -> typing.Any:
         annotation: a dataclass, a union of dataclasses, None, bool, int, float, str, Path, a Literal of texts, or
             tuples of these. Paths are taken relative to the file.
         node: of the file.
-
-    Raises:
-        InputError: if a value has the wrong type or a key is unknown.
     """
     origin, choices = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):

@@ -38,11 +38,7 @@ class Overrides:
     """Refuse a sequence in which a link leads out of it."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            InputError: if they cannot be.
-        """
+        """Check the numbers."""
         if self.intrinsics is not None and not sane(self.intrinsics):
             shown = " ".join(f"{value:g}" for value in self.intrinsics)
             raise InputError(
@@ -115,11 +111,7 @@ class CameraFacts:
         return self.by in OF_PHONES
 
     def lens(self, size: tuple[int, int]) -> Lens:
-        """Return the camera, with its lens, for images of (width, height).
-
-        Raises:
-            InputError: if the distortion is by an unknown model.
-        """
+        """Return the camera, with its lens, for images of (width, height)."""
         return lens_of_model(Camera(*size, *self.intrinsics), self.distortion, self.model, self.by)
 
     def scaled(self, size: tuple[int, int]) -> CameraFacts:
@@ -157,11 +149,7 @@ class CameraFacts:
 
 
 def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:
-    """Return the camera of a folder of images; None without intrinsics.
-
-    Raises:
-        InputError: if a file of intrinsics cannot be read.
-    """
+    """Return the camera of a folder of images; None without intrinsics."""
     if overrides.intrinsics is not None:
         return CameraFacts(overrides.intrinsics, "`intrinsics`")
     named = [folder / name for name in NAMES]
@@ -228,11 +216,7 @@ def _describes_camera(node: Node) -> bool:
 
 
 def camera_of(node: Node, name: str) -> CameraFacts:
-    """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name.
-
-    Raises:
-        InputError: if it describes no camera.
-    """
+    """Read what Open3D writes (columns of the matrix in turn), a matrix in rows, or fx, fy, cx, cy by name."""
     scale = _first(node, _SCALES)
     node = next((within for key in ("cam0", *_WITHIN) if (within := _inner(node, key)) is not None), node)
     width, height = _first(node, _WIDTHS), _first(node, _HEIGHTS)
@@ -249,11 +233,7 @@ def camera_of(node: Node, name: str) -> CameraFacts:
 
 
 def cameras_of_frames(path: Path, stems: Iterable[str], size: tuple[int, int]) -> dict[str, CameraFacts]:
-    """Return the camera of each depth image of (width, height) by name, as Polycam and `transforms.json` have it.
-
-    Raises:
-        InputError: if a file of a camera cannot be read.
-    """
+    """Return the camera of each depth image of (width, height) by name, as Polycam and `transforms.json` have it."""
     if is_there(path / "transforms.json"):
         whole = read_tree(path / "transforms.json")
         frames = whole.get("frames")

@@ -38,11 +38,7 @@ _DEPTH_MODES: dict[Size, tuple[Size, Size]] = {  # image: (binned sensor, corner
 
 
 def depth_lens(calibration: Node, size: Size, intrinsics: Intrinsics | None) -> Lens:
-    """Return the depth camera for images of (width, height).
-
-    Raises:
-        InputError: if the size is of no mode of the camera, or the calibration lacks something.
-    """
+    """Return the depth camera for images of (width, height)."""
     if intrinsics is not None:
         return Lens(Camera(*size, *intrinsics), ())
     if size not in _DEPTH_MODES:
@@ -54,21 +50,13 @@ def depth_lens(calibration: Node, size: Size, intrinsics: Intrinsics | None) -> 
 
 
 def colour_lens(calibration: Node, size: Size) -> Lens:
-    """Return the colour camera for images of (width, height): the sensor of 4 : 3, cropped above and below for 16 : 9.
-
-    Raises:
-        InputError: if the calibration lacks something.
-    """
+    """Return the colour camera for images of (width, height): of the sensor of 4 : 3, cropped for 16 : 9."""
     whole = size[0], size[0] * 3 // 4
     return _lens(calibration, COLOUR, size, whole, (0, (whole[1] - size[1]) // 2))
 
 
 def colour_from_depth(calibration: Node) -> Array:
-    """Return the motion (4, 4), in m, that takes points of the depth camera to the colour camera.
-
-    Raises:
-        InputError: if the calibration lacks something.
-    """
+    """Return the motion (4, 4), in m, that takes points of the depth camera to the colour camera."""
     return _camera_from_device(calibration, COLOUR) @ se3.inverse(_camera_from_device(calibration, DEPTH))
 
 
@@ -155,11 +143,7 @@ class KinectSequence(AbstractStreams[int]):
 
 
 def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
-    """Open a recording.
-
-    Raises:
-        InputError: if PyAV is not installed, or the file is no such recording.
-    """
+    """Open a recording."""
     file = Matroska(path)
     calibration = Node(file.calibration(), path)
     size = file.size("DEPTH")
@@ -201,11 +185,7 @@ class Matroska:
     """The file."""
 
     def calibration(self) -> Any:
-        """Return the contents of `calibration.json`, attached to the recording.
-
-        Raises:
-            InputError: if it is not attached.
-        """
+        """Return the contents of `calibration.json`, attached to the recording."""
         with input_errors(self.path, "recording", _AGAIN):
             for attached in self._container.streams.attachments:
                 if attached.name == "calibration.json":
@@ -234,11 +214,7 @@ class Matroska:
             return bytes(self._find(title, stamp))
 
     def image(self, title: str, stamp: int, where: str) -> npt.NDArray[np.uint8]:
-        """Return one image as RGB (h, w, 3); `where` is for error messages.
-
-        Raises:
-            InputError: if it cannot be decoded.
-        """
+        """Return one image as RGB (h, w, 3); `where` is for error messages."""
         with input_errors(self.path, "recording", _AGAIN):
             packet = self._find(title, stamp)
             content = bytes(packet)

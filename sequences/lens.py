@@ -91,11 +91,7 @@ _BROWN_COUNT = 8
 
 
 def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where: str) -> Lens:
-    """Return the lens that a file describes.
-
-    Raises:
-        InputError: if there is distortion by an unknown model.
-    """
+    """Return the lens that a file describes."""
     values, name = coefficients(distortion), re.sub(r"[\s-]+", "_", model.strip().lower())
     if name in _FISHEYE and len(values) <= 4:
         return Lens(camera, values, fisheye=True)

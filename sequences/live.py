@@ -50,11 +50,7 @@ class RunningCamera:
     """What the library raises."""
 
     def take(self) -> Image:
-        """Return the newest image; older ones are dropped.
-
-        Raises:
-            InputError: if the camera gives none.
-        """
+        """Return the newest image; older ones are dropped."""
         try:
             image = self.newest()
         except self.failures as error:
@@ -166,11 +162,7 @@ _TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")
 
 
 def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveSequence:
-    """Start a camera.
-
-    Raises:
-        InputError: if the library is not installed, or no such camera gives images.
-    """
+    """Start a camera."""
     try:
         library = importlib.import_module("pyrealsense2")
     except ImportError:

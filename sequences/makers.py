@@ -22,11 +22,7 @@ _OAK_PX: Final = (640, 400)  # width and height of depth and colour: stereo of a
 
 
 def orbbec(ob: Any, serial: str) -> RunningCamera:
-    """Start an Orbbec camera.
-
-    Raises:
-        InputError: if it cannot be started.
-    """
+    """Start an Orbbec camera."""
     where, failures = f"orbbec:{serial}", (ob.OBError, RuntimeError)
     try:
         devices = ob.Context().query_devices()
@@ -71,11 +67,7 @@ def orbbec(ob: Any, serial: str) -> RunningCamera:
 
 
 def oak(dai: Any, serial: str) -> RunningCamera:
-    """Start an OAK camera, with depth on the pixels of its colour camera, from whose images the lens is taken out.
-
-    Raises:
-        InputError: if it cannot be started.
-    """
+    """Start an OAK camera, with depth on the pixels of its colour camera, from whose images the lens is taken out."""
     where, failures = f"oak:{serial}", (RuntimeError,)
     try:
         device = dai.Device(serial) if serial else dai.Device()
@@ -122,11 +114,7 @@ def oak(dai: Any, serial: str) -> RunningCamera:
 
 
 def azure(k4a: Any, serial: str) -> RunningCamera:
-    """Start an Azure Kinect, or with Orbbec's library in place of Microsoft's a Femto.
-
-    Raises:
-        InputError: if it cannot be started.
-    """
+    """Start an Azure Kinect, or with Orbbec's library in place of Microsoft's a Femto."""
     where, failures = f"azure:{serial}", (k4a.K4AException, RuntimeError)
     try:
         present = []
@@ -170,11 +158,7 @@ LIBRARIES: Final[Mapping[str, tuple[str, str, Callable[[Any, str], RunningCamera
 
 
 def open_camera_of(maker: str, serial: str, overrides: Overrides) -> LiveSequence:
-    """Start a camera.
-
-    Raises:
-        InputError: if the library is not installed, or no such camera gives images.
-    """
+    """Start a camera."""
     module, extra, start = LIBRARIES[maker]
     try:
         library = importlib.import_module(module)

@@ -90,11 +90,7 @@ def _joined_uv(meshes: list[Mesh]) -> Array | None:
 
 
 def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
-    """Return the triangles of a mesh file (PLY, OBJ, STL, GLB, ...), its lengths times `scale` in m.
-
-    Raises:
-        InputError: if the file is missing, cannot be read or holds no triangle.
-    """
+    """Return the triangles of a mesh file (PLY, OBJ, STL, GLB, ...), its lengths times `scale` in m."""
     import trimesh  # slow to import, and only needed here
 
     content = read_regular(path)

@@ -283,11 +283,7 @@ class Calibration:
 
 
 def calibrate(sequence: AbstractSequence) -> Calibration:
-    """Measure the noise of the camera that took a sequence.
-
-    Raises:
-        InputError: if the scene moves, or shows too little: fewer than 3 frames, no smooth surface, no border.
-    """
+    """Measure the noise of the camera that took a sequence."""
     indices = sequence.indices[:MOST_FRAMES]
     if len(indices) < 3:
         raise InputError(f"{sequence.name}: has {len(indices)} frames; record at least 3, better 10, of a still scene.")

@@ -100,11 +100,7 @@ def _archive_of(path: Path, owner: object) -> zipfile.ZipFile:
 
 
 def open_record3d(path: Path, overrides: Overrides) -> Record3DSequence:
-    """Open an archive of Record3D.
-
-    Raises:
-        InputError: if it is none.
-    """
+    """Open an archive of Record3D."""
     with input_errors(path, "recording", _AGAIN), open_regular(path) as file, zipfile.ZipFile(file) as archive:
         if archive.getinfo("metadata").file_size > _MOST_BYTES:
             raise ValueError("metadata is larger than it can be")
@@ -128,11 +124,7 @@ def open_record3d(path: Path, overrides: Overrides) -> Record3DSequence:
 
 
 def images_of_transforms(path: Path) -> FoundImages | None:
-    """Return the images that nerfstudio's `transforms.json` lists; None if it lists no depth.
-
-    Raises:
-        InputError: if it cannot be read, or names an image that is not in the folder.
-    """
+    """Return the images that nerfstudio's `transforms.json` lists; None if it lists no depth."""
     if not is_there(path / "transforms.json"):
         return None
     frames = read_tree(path / "transforms.json").get("frames")

@@ -44,11 +44,7 @@ class AbstractRecording(AbstractSequence):
     """Kind of the depth camera, of `MULTIPATH`, where the format tells it."""
 
     def __post_init__(self) -> None:
-        """Check `sequence.json`.
-
-        Raises:
-            InputError: if it cannot be used.
-        """
+        """Check `sequence.json`."""
         _ = self.name, self.sensor(), self.motion
 
     @property
@@ -193,19 +189,11 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
 
     @abstractmethod
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
-        """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured.
-
-        Raises:
-            InputError: if it cannot be read.
-        """
+        """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
 
     @abstractmethod
     def colour_at(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
-        """Return colour (h, w, 3) as RGB at the pixels of a depth image (h, w) without distortion; None without.
-
-        Raises:
-            InputError: if it cannot be read.
-        """
+        """Return colour (h, w, 3) as RGB at the pixels of a depth image (h, w) without distortion; None without."""
 
     @property
     def indices(self) -> tuple[int, ...]:

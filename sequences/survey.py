@@ -346,11 +346,7 @@ _GAP = 4
 
 
 def write_picture(path: Path, frames: Sequence[Frame]) -> None:
-    """Write a PNG with a row a frame: depth from near (light) to far (dark), colour or depth with edges, the mask.
-
-    Raises:
-        InputError: if it cannot be written.
-    """
+    """Write a PNG with a row a frame: depth from near (light) to far (dark), colour or depth with edges, the mask."""
     rows = [np.concatenate([np.pad(image, _PAD) for image in _images(frame)], axis=1) for frame in frames]
     width = max(row.shape[1] for row in rows)
     whole = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])

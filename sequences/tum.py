@@ -27,11 +27,7 @@ MAX_GAP_S = 0.2
 
 
 def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
-    """Open a folder with `depth.txt` and, where they are there, `rgb.txt`, `groundtruth.txt`, `mask/` and `mask_hand/`.
-
-    Raises:
-        InputError: if it is not readable as such.
-    """
+    """Open a folder with `depth.txt`, and perhaps `rgb.txt`, `groundtruth.txt`, `mask/` and `mask_hand/`."""
     depth = _list(path / "depth.txt", 2)
     if not depth:
         raise InputError(f"{path / 'depth.txt'}: lists no depth image; write lines 'time path'.")
@@ -84,11 +80,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
 
 
 def trajectory(path: Path) -> list[tuple[float, Array]]:
-    """Return times in s and poses (4, 4) in m of a file with lines `time tx ty tz qx qy qz qw`.
-
-    Raises:
-        InputError: if a line says something else, or times do not grow.
-    """
+    """Return times in s and poses (4, 4) in m of a file with lines `time tx ty tz qx qy qz qw`."""
     poses = []
     for time_s, words in _list(path, 8):
         try:

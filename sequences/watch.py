@@ -66,11 +66,7 @@ class WatchedSequence(AbstractLive, AbstractDerived):
         return self.whole
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield each frame when it is complete, until none has come for a while.
-
-        Raises:
-            InputError: if the data at the end cannot be read.
-        """
+        """Yield each frame when it is complete, until none has come for a while."""
         wanted = -1
         for frame in arriving(self.path, self.overrides, self.patience, self.stop):
             if self.kept.stop is not None and frame.index >= self.kept.stop:
@@ -96,9 +92,6 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
 
     They ascend, but for a frame that comes, or can be read, only after later ones. What can never be read is reported
     to the log and left out, if there are other frames.
-
-    Raises:
-        InputError: if nothing can be read.
     """
     taken: set[int] = set()
     failing: dict[int, _Failing] = {}

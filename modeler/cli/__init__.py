@@ -1,7 +1,7 @@
 """The command line: the composition root, the only module that imports everything.
 
-Each command is a frozen dataclass whose fields are its options; `run` returns the exit status. Heavy imports are inside
-functions, so that help appears at once.
+Each command is a frozen dataclass whose fields are its options; `run` returns the exit status, or raises `InputError`
+where options, input or output cannot be used. Heavy imports are inside functions, so that help appears at once.
 """
 
 import contextlib

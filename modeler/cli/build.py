@@ -68,11 +68,7 @@ class Build:
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
-        """Run the loop into a run folder; status 3 if the model cannot be trusted; report.json has the reasons.
-
-        Raises:
-            InputError: if the input or the folder cannot be used.
-        """
+        """Run the loop into a run folder; status 3 if the model cannot be trusted; report.json has the reasons."""
         from modeler.composition import compose
         from modeler.export import PairCache, RunFolder, RunMeta, locked
         from modeler.runs.outputs import check_run_folder, run_inputs

@@ -34,11 +34,7 @@ class CalibrateSensor:
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
-        """Measure the noise, store it, and print it by distance and angle.
-
-        Raises:
-            InputError: if the input cannot be used or the file cannot be written.
-        """
+        """Measure the noise, store it, and print it by distance and angle."""
         from modeler.cli.reading import reading
         from modeler.export import write_atomically
         from modeler.runs.outputs import check_files
@@ -125,11 +121,7 @@ class CalibrateCamera:
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
-        """Estimate the focal length and store it; status 3 if no loop determines it.
-
-        Raises:
-            InputError: if the run cannot be used or the file cannot be written.
-        """
+        """Estimate the focal length and store it; status 3 if no loop determines it."""
         from modeler.export import write_atomically
         from modeler.graph.focal import FocalCalibrator
         from modeler.runs.outputs import check_files, run_inputs

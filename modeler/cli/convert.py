@@ -36,11 +36,7 @@ class Convert:
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
-        """Write the input as a BOP scene folder, or the poses of a run.
-
-        Raises:
-            InputError: if the input cannot be used or the output cannot be written.
-        """
+        """Write the input as a BOP scene folder, or the poses of a run."""
         from modeler.cli.reading import reading, while_it_lasts
         from modeler.runs.outputs import check_files, check_folder, run_inputs
         from modeler.runs.reopening import calibrated

@@ -29,11 +29,7 @@ class Edit:
     """Replace the results of an earlier run in RUN2."""
 
     def run(self) -> int:
-        """Edit the run; status 3 if the result cannot be trusted; report.json has the reasons.
-
-        Raises:
-            InputError: if the run cannot be read, or the frames are not in it.
-        """
+        """Edit the run; status 3 if the result cannot be trusted; report.json has the reasons."""
         from modeler.export import RunFolder, poses_of
         from modeler.runs.editing import edit
         from modeler.runs.outputs import check_run_folder, run_inputs
@@ -102,11 +98,7 @@ class Join:
     """Same seed, same machine, same result, to the bit."""
 
     def run(self) -> int:
-        """Join the runs; status 3 if the result cannot be trusted; report.json has the reasons.
-
-        Raises:
-            InputError: if a run cannot be read, or no pair of their views can be registered.
-        """
+        """Join the runs; status 3 if the result cannot be trusted; report.json has the reasons."""
         from modeler.runs.joining import join
 
         _check(self)

@@ -69,9 +69,6 @@ class Evaluate:
         """Run the experiment, write its results and print a table.
 
         Runs that cannot be evaluated are left out, each with a line on stderr, and the status is 2.
-
-        Raises:
-            InputError: if an option, a sequence or the folder cannot be used.
         """
         from modeler.runs.outputs import check_files, run_inputs
         from modeler.types import InputError

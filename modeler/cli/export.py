@@ -71,11 +71,7 @@ class Export:
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
-        """Write the mesh.
-
-        Raises:
-            InputError: if options exclude each other, or something cannot be read or written.
-        """
+        """Write the mesh."""
         if self.purpose is not None:
             return self._for(self.purpose)
         from modeler import export as files

@@ -34,11 +34,7 @@ class Info:
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
-        """Print what was found.
-
-        Raises:
-            InputError: if the input cannot be used.
-        """
+        """Print what was found."""
         from json import dumps
 
         from modeler.cli.reading import reading

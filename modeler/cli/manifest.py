@@ -44,9 +44,6 @@ def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
     Args:
         path: the file; paths in it are taken as on the command line.
         common: default options for every row.
-
-    Raises:
-        InputError: if it cannot be read, a column is unknown, or a row's options cannot be used.
     """
     from modeler.sequences.input_files import read_text
 
@@ -122,9 +119,6 @@ def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:
 
     A sequence that the folder knows keeps its name. Others are called as their file or folder, and where that name is
     taken, with a few digits more, which depend on nothing but their path.
-
-    Raises:
-        InputError: if a name is given that cannot be one, or is given twice.
     """
     notes = sorted((out / NOTES).glob("*.json")) if (out / NOTES).is_dir() else []
     known = {str(read_note(note).get("sequence", "")): note.stem for note in notes}

@@ -102,11 +102,7 @@ class InputOptions:
     strict_paths: StrictPaths = False
 
     def overrides(self) -> Overrides:
-        """Return them for the readers of sequences.
-
-        Raises:
-            InputError: if one cannot be.
-        """
+        """Return them for the readers of sequences."""
         from modeler.sequences import Overrides
 
         return Overrides(**{name: value for name, value in asdict(self).items() if name != "despite_doubts"})

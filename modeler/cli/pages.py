@@ -106,11 +106,7 @@ class Gallery:
     """Replace an existing page."""
 
     def run(self) -> int:
-        """Write the page.
-
-        Raises:
-            InputError: if the folder holds no run, or the page cannot be written.
-        """
+        """Write the page."""
         import os
         from urllib.parse import quote
 
@@ -170,11 +166,7 @@ class Studio:
     """Port to serve on."""
 
     def run(self) -> int:
-        """Serve the page until Ctrl-C.
-
-        Raises:
-            InputError: if the folder cannot be used, or a package is missing.
-        """
+        """Serve the page until Ctrl-C."""
         from modeler.system.processes import check_installed
         from modeler.types import InputError
 

@@ -70,9 +70,6 @@ def watched(path: Path, overrides: Overrides, idle_s: float) -> AbstractSequence
         path: where it writes.
         overrides: values that take precedence over its files.
         idle_s: the sequence is over after this many seconds without a new frame.
-
-    Raises:
-        InputError: if nothing readable comes.
     """
     if not 0.0 < idle_s < math.inf:
         raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")

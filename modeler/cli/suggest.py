@@ -45,11 +45,7 @@ class Suggest:
     moved: MovedOptions = field(default_factory=MovedOptions)
 
     def run(self) -> int:
-        """Print the list; status 3 if a goal was given and is not reached.
-
-        Raises:
-            InputError: if the run or the candidates cannot be used.
-        """
+        """Print the list; status 3 if a goal was given and is not reached."""
         from modeler.composition.candidate_file import read_candidates
         from modeler.runs.reopening import reopened
         from modeler.suggestion import suggest

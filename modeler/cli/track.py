@@ -65,11 +65,7 @@ class Track:
     given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
-        """Track the object; status 3 if a frame is left in doubt: poses.json has the reasons.
-
-        Raises:
-            InputError: if model, sequence or folder cannot be used.
-        """
+        """Track the object; status 3 if a frame is left in doubt: poses.json has the reasons."""
         from modeler.export import locked
         from modeler.runs.known_objects import known_object
         from modeler.runs.outputs import check_folder, run_inputs

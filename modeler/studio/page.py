@@ -115,11 +115,7 @@ class Page:
         return self.studio.queue.current is not None
 
     async def run(self, jobs: Sequence[Job]) -> None:
-        """Have commands run, one after another, builds among them seen in the viewer.
-
-        Raises:
-            InputError: if the viewer does not start.
-        """
+        """Have commands run, one after another, builds among them seen in the viewer."""
         for job in jobs:
             if job.words[0] == "build":
                 sink = await run.io_bound(self.viewers.sink, job.words[job.words.index("--out") + 1])

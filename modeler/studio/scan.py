@@ -60,11 +60,7 @@ class Choices:
 
     @classmethod
     def read(cls, path: Path) -> Choices:
-        """Read the choices of a scan.
-
-        Raises:
-            InputError: if the file is none of ours.
-        """
+        """Read the choices of a scan."""
         try:
             found = json.loads(read_regular(path))
             known = {one.name for one in fields(cls)}
@@ -96,11 +92,7 @@ class Scan:
     """A capture being made into a model. Methods may be called from any thread."""
 
     def __init__(self, folder: Path, choices: Choices) -> None:
-        """Open a capture, and begin to look for the object in it.
-
-        Raises:
-            InputError: if it cannot be read.
-        """
+        """Open a capture, and begin to look for the object in it."""
         self.folder, self.choices = folder, choices
         self.sequence: AbstractSequence = KeptSequence(open_sequence(Path(choices.sequence)))
         self.version = 0
@@ -170,9 +162,6 @@ class Scan:
         """Say that the object is at a pixel: it is looked for in the whole image, then in boxes around the pixel.
 
         The first is taken in which an object is found there that does not reach the edge of the box.
-
-        Raises:
-            InputError: if none is found there.
         """
         image = self.sequence.frame(frame)
         column, row, camera = int(x), int(y), image.camera
@@ -204,9 +193,6 @@ class Scan:
             points: (x, y) in px along the stroke.
             radius_px: of the brush.
             add: whether the stroke is object; otherwise it is not.
-
-        Raises:
-            InputError: if the object has not been looked for in that frame yet.
         """
         mask = self.mask(frame)
         if mask is None:
@@ -244,11 +230,7 @@ class Scan:
         return None
 
     def build_jobs(self, *, resume: bool = False) -> list[Job]:
-        """Return the build that the choices ask for, and its page; painted masks are written where it reads them.
-
-        Raises:
-            InputError: if the masks cannot be written.
-        """
+        """Return the build that the choices ask for, and its page; painted masks are written where it reads them."""
         run = self.runs()[-1] if resume else next_run(self.folder)
         words = ["build", str(self._source()), "--out", str(run), *self.options(), *(["--resume"] if resume else [])]
         if not resume:

@@ -240,11 +240,7 @@ class Viewers:
 
 
 def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
-    """Serve the page on 127.0.0.1 until the user ends it; builds that run then make the model of the frames so far.
-
-    Raises:
-        InputError: if the port cannot be had.
-    """
+    """Serve the page on 127.0.0.1 until the user ends it; builds that run then make the model of the frames so far."""
     listening = _listening(port)
     port, token = int(listening.getsockname()[1]), secrets.token_urlsafe(24)
     address = f"http://{HOST}:{port}"

@@ -19,11 +19,7 @@ class Studio:
     """All scans of a folder, and the commands that run: what every page shows."""
 
     def __init__(self, out: Path, place: Path | None = None) -> None:
-        """Take the folder in which scans are kept, and the one in which captures are offered first.
-
-        Raises:
-            InputError: if the folder cannot be made.
-        """
+        """Take the folder in which scans are kept, and the one in which captures are offered first."""
         self.out = out
         self.place = place
         try:
@@ -42,11 +38,7 @@ class Studio:
         self._scans: dict[Path, Scan] = {}
 
     def open(self, sequence: Path) -> Scan:
-        """Go on with the scan of a capture, or begin one.
-
-        Raises:
-            InputError: if it is no capture.
-        """
+        """Go on with the scan of a capture, or begin one."""
         folder, choices = self._chosen(sequence)
         if folder not in self._scans:
             scan = self._scans[folder] = Scan(folder, choices)
@@ -69,11 +61,7 @@ class Studio:
         return [job, page_job(run)]
 
     def record(self, camera: str, prior: str | None, step_deg: float | None) -> list[Job]:
-        """Build from the views that a person takes with a connected camera.
-
-        Raises:
-            InputError: if the camera cannot be had.
-        """
+        """Build from the views that a person takes with a connected camera."""
         self.release()
         sequence = open_sequence(camera)
         stem = camera.partition(":")[0]

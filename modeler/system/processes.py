@@ -9,8 +9,6 @@ import os
 import shlex
 import sys
 
-from modeler.types import InputError
-
 _M_ARENA_MAX = -8  # of mallopt(3)
 
 
@@ -53,5 +51,7 @@ def check_installed(module: str, package: str, extra: str) -> None:
     Raises:
         InputError: if it is not installed.
     """
+    from modeler.types import InputError  # not with the command line's help
+
     if importlib.util.find_spec(module) is None:
         raise InputError(f"{package} is not installed; {install_command(extra)}")

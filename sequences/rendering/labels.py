@@ -170,11 +170,7 @@ class Unwrapped:
         return 1
 
     def charts(self, mesh: Mesh) -> tuple[Chart, ...]:
-        """Return the charts of a mesh.
-
-        Raises:
-            InputError: if the mesh has no texture coordinates.
-        """
+        """Return the charts of a mesh."""
         if mesh.uv is None:
             raise InputError("the object has no texture coordinates; give a mesh file that has, or another wrap.")
         there = np.isfinite(mesh.uv).all(axis=(1, 2))
@@ -341,11 +337,7 @@ class Embedded:
     """The image in the object's own mesh file."""
 
     def image(self, mesh: Mesh, chart: Chart, number: int, texel_m: float) -> Float32Array:
-        """Return the print of a chart (h, w, 3), in sRGB, 0 to 1.
-
-        Raises:
-            InputError: if the mesh has none.
-        """
+        """Return the print of a chart (h, w, 3), in sRGB, 0 to 1."""
         if mesh.picture is None:
             raise InputError("the object's file holds no image; give a GLB file with one, or a picture.")
         return _fitted(mesh.picture, chart, texel_m)

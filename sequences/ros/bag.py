@@ -45,9 +45,6 @@ def database(path: Path) -> Sqlite3Reader:
     """Return the library's reader of a file, which is not open yet.
 
     What a hostile file would have computed, such as a view that never ends, is refused.
-
-    Raises:
-        InputError: when it is opened, if part of its messages lies beside it.
     """
     reader: Any = Sqlite3Reader(Path(quote(str(path))))  # quoted for an address, as the library expects it
     opening, reading, work = reader.open, reader.messages, _Work(path)
@@ -264,11 +261,7 @@ class Bag:
         return {topic: kind for topic, kind in named if topic.isprintable()}
 
     def messages(self, topic: str, most: int | None = None) -> Iterator[tuple[Stamp, Any]]:
-        """Read the messages of a topic in the order in which they were received.
-
-        Raises:
-            InputError: if the bag is broken.
-        """
+        """Read the messages of a topic in the order in which they were received."""
         with input_errors(self.path, "bag", self._advice):
             stamp = Stamp(-1)
             for count, (connection, received_ns, data) in enumerate(self._reader.messages(self._of(topic))):
@@ -279,11 +272,7 @@ class Bag:
                 yield stamp, self._message(connection, data)
 
     def message(self, topic: str, stamp: Stamp) -> Any:
-        """Return one message.
-
-        Raises:
-            InputError: if the bag is broken.
-        """
+        """Return one message."""
         with input_errors(self.path, "bag", self._advice):
             start = stamp.received_ns
             found = self._reader.messages(self._of(topic), start=start, stop=start + 1)

@@ -45,11 +45,7 @@ def is_colour(message: Any) -> bool:
 
 
 def depth_m(message: Any, unit_mm: float, where: str) -> npt.NDArray[np.float32]:
-    """Return depth (h, w) in m, NaN where nothing was measured, of an image for which `is_depth`.
-
-    Raises:
-        InputError: if the message contradicts itself.
-    """
+    """Return depth (h, w) in m, NaN where nothing was measured, of an image for which `is_depth`."""
     if not is_depth(message):
         raise InputError(f"{where}: is {_kind(message)} where images before it are depth; record it again.")
     if _is_raw(message) and message.encoding in METRES:
@@ -72,9 +68,6 @@ def from_rvl(data: bytes, where: str) -> npt.NDArray[np.uint16]:
     Numbers are of digits of three bits, lowest first, in groups of four bits, the highest of which says that more
     follow. They are the lengths of runs without and with depth in turn, and after the second the differences along it,
     with their sign in the lowest bit.
-
-    Raises:
-        InputError: if it is cut off, or is too large.
     """
     width, height = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
     if not 0 < width * height <= MAX_PIXELS:
@@ -103,11 +96,7 @@ def from_rvl(data: bytes, where: str) -> npt.NDArray[np.uint16]:
 
 
 def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
-    """Return colour (h, w, 3) as RGB of an image for which `is_colour`.
-
-    Raises:
-        InputError: if the message contradicts itself.
-    """
+    """Return colour (h, w, 3) as RGB of an image for which `is_colour`."""
     if not is_colour(message):
         raise InputError(f"{where}: is {_kind(message)} where images before it are colour; record it again.")
     packed = None if _is_raw(message) else _PACKED_YUV.fullmatch(message.format)
@@ -149,11 +138,7 @@ def _unpacked(message: Any, packing: re.Match[str], where: str) -> _Raw:
 
 
 def lens(message: Any, where: str, *, ros1: bool) -> Lens:
-    """Return the camera that a CameraInfo message describes.
-
-    Raises:
-        InputError: if it is not calibrated, or is no pinhole camera with common distortion.
-    """
+    """Return the camera that a CameraInfo message describes."""
     matrix = np.asarray(message.K if ros1 else message.k, dtype=np.float64)
     distortion = np.asarray(message.D if ros1 else message.d, dtype=np.float64)
     fx, _, cx, _, fy, cy = (float(value) for value in matrix[:6])

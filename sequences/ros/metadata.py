@@ -82,11 +82,7 @@ def realsense_unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
 
 
 def realsense_lens(bag: Bag, topic: str) -> Lens | None:
-    """Return the camera of a topic from a text message, as version 2.58 writes it; None without.
-
-    Raises:
-        InputError: if the text describes no camera.
-    """
+    """Return the camera of a topic from a text message, as version 2.58 writes it; None without."""
     stream = re.match(_STREAM, topic)
     name = None if stream is None else f"{stream[0]}/camera_info"
     if name is None or bag.types.get(name) != TEXT:
@@ -105,11 +101,7 @@ def realsense_lens(bag: Bag, topic: str) -> Lens | None:
 
 
 def realsense_colour_from_depth(bag: Bag, colour_topic: str, depth_topic: str) -> Array | None:
-    """Return the motion (4, 4), in m, from the depth to the colour camera; None if unknown.
-
-    Raises:
-        InputError: if it is not rigid.
-    """
+    """Return the motion (4, 4), in m, from the depth to the colour camera; None if unknown."""
     poses = [_from_reference(bag, topic) for topic in (colour_topic, depth_topic)]
     colour, depth = poses
     return None if colour is None or depth is None else colour @ se3.inverse(depth)

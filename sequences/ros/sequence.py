@@ -36,11 +36,7 @@ def first_images(bag: Bag) -> dict[str, Any]:
 
 
 def choose_depth_topic(bag: Bag, first: Mapping[str, Any], overrides: Overrides) -> str:
-    """Return the topic of depth images.
-
-    Raises:
-        InputError: if there is none, or several.
-    """
+    """Return the topic of depth images."""
     found = [topic for topic, message in first.items() if messages.is_depth(message)]
     if overrides.depth_topic is not None:
         if overrides.depth_topic not in found:
@@ -60,11 +56,7 @@ def choose_depth_topic(bag: Bag, first: Mapping[str, Any], overrides: Overrides)
 
 
 def depth_lens(bag: Bag, topic: str, image: Any, overrides: Overrides) -> Lens:
-    """Return the camera of a topic.
-
-    Raises:
-        InputError: if it is unknown.
-    """
+    """Return the camera of a topic."""
     if overrides.intrinsics is not None:
         if image.__msgtype__ == messages.IMAGE:
             return Lens(Camera(int(image.width), int(image.height), *overrides.intrinsics), ())
@@ -105,11 +97,7 @@ class ColourSource:
 def colour_source(
     bag: Bag, first: Mapping[str, Any], depth: tuple[str, Lens], overrides: Overrides
 ) -> tuple[ColourSource | None, list[str]]:
-    """Return the source of colour that is or can be aligned to depth, and a note on other colour.
-
-    Raises:
-        InputError: if the topic asked for holds none.
-    """
+    """Return the source of colour that is or can be aligned to depth, and a note on other colour."""
     found = [topic for topic, message in first.items() if messages.is_colour(message)]
     if overrides.colour_topic is not None:
         if overrides.colour_topic not in found:
@@ -228,11 +216,7 @@ class RosSequence(AbstractStreams[Stamp]):
 
 
 def open_ros(path: Path, overrides: Overrides) -> RosSequence:
-    """Open a bag; topics of depth and colour are recognised from their messages.
-
-    Raises:
-        InputError: if it is no bag, or lacks depth images or their camera.
-    """
+    """Open a bag; topics of depth and colour are recognised from their messages."""
     bag = Bag(path)
     first = first_images(bag)
     depth_topic = choose_depth_topic(bag, first, overrides)

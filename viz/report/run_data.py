@@ -35,11 +35,7 @@ class Result:
 
     @classmethod
     def read(cls, path: Path, truth: Mapping[int, Array] | None = None) -> Result:
-        """Read a run folder.
-
-        Raises:
-            InputError: if there is no run, or no frame of it was accepted.
-        """
+        """Read a run folder."""
         report = RunFolder(path).report()
         if not report["poses"]:
             raise InputError(f"{path}: no frame of this run was accepted; report.json says why")
