@@ -137,7 +137,9 @@ class CalibratedSequence(AbstractDerived):
         return self.noise.at(object_distance_m(self.whole.frame(self.whole.indices[0])))
 
 
-_ALIKE = 1e-3  # relative: files have rounded values
+def has_focal(frame: Frame, stated_px: float) -> bool:
+    """Return whether the focal length of a frame is the stated one of a camera; files have rounded values."""
+    return abs(frame.camera.fx / stated_px - 1.0) <= 1e-3
 
 
 @final
@@ -224,7 +226,7 @@ class RefocusedSequence(AbstractDerived):
 
     def _refocused(self, frame: Frame) -> Frame:
         camera, focal = frame.camera, self.focal
-        if abs(camera.fx / focal.stated_px - 1.0) > _ALIKE:
+        if not has_focal(frame, focal.stated_px):
             raise InputError(
                 f"{self.name}: frame {frame.index} has fx {camera.fx:g} px where the calibrated camera has "
                 f"{focal.stated_px:g}; give the calibration of this camera"

@@ -17,10 +17,11 @@ from typing import BinaryIO, Final, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from modeler.sequences.depth_files import LEAST_MM
 from modeler.sequences.file_names import frame_numbers, said_of_angles
 from modeler.sequences.image_files import MAX_PIXELS
 from modeler.sequences.input_files import input_errors, list_images
-from modeler.sequences.intrinsics import Intrinsics, Overrides, find_intrinsics, sane
+from modeler.sequences.intrinsics import MAX_ASPECT, Intrinsics, Overrides, find_intrinsics, sane
 from modeler.sequences.recording import AbstractRecording
 from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import Array, Camera, Frame, InputError
@@ -164,7 +165,6 @@ def _intrinsics(
 
 _LEAST_Z = 1e-9
 _BEFORE = 100  # times as many points before the camera as behind it
-_LEAST_MM = 50.0  # median depth: nothing is 50 m away, nor 50 mm
 
 
 def _unit_mm(cloud: _Cloud, overrides: Overrides) -> tuple[float, str]:
@@ -173,7 +173,7 @@ def _unit_mm(cloud: _Cloud, overrides: Overrides) -> tuple[float, str]:
         return overrides.depth_scale_mm, "`depth_scale_mm`"
     measured = np.abs(cloud.points[:, 2])
     measured = measured[measured > _LEAST_Z]
-    in_mm = measured.size > 0 and float(np.median(measured)) > _LEAST_MM
+    in_mm = measured.size > 0 and float(np.median(measured)) > LEAST_MM
     return (1.0, "by the size of the coordinates") if in_mm else (1000.0, "the coordinates")
 
 
@@ -200,7 +200,7 @@ def _slopes(points: npt.NDArray[np.float64]) -> Array:
 def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
     """Return the intrinsics of a grid of pixels whose rays points (n, 2) lie on, the principal point but for pixels."""
     (fx, cx), (fy, cy) = _steps(slopes[:, 0]), _steps(slopes[:, 1])
-    if not sane((fx, fy, cx, cy)) or max(fx, fy) > _MAX_ASPECT * min(fx, fy):
+    if not sane((fx, fy, cx, cy)) or max(fx, fy) > MAX_ASPECT * min(fx, fy):
         raise InputError(
             f"{path}: is not organised as an image of columns and rows, nor do its points lie on the rays of a grid of "
             "pixels; save the camera's cloud or depth image as it comes, or give `intrinsics` FX FY CX CY."
@@ -208,7 +208,6 @@ def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
     return fx, fy, cx, cy
 
 
-_MAX_ASPECT = 1.5
 _STEEPEST = 1e3  # no camera sees so far to the side
 _FINEST_PX, _COARSEST_PX = 5000.0, 50.0
 _BINS = 1 << 18

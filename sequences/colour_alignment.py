@@ -55,7 +55,6 @@ class Misalignment:
 
 _PLAIN, _NO_BETTER = 4.5, 4.0  # standard deviations; aligned captures of cameras have 5 to 15
 _STRONG, _CLEAR = 1.0, 7.0  # least correlation, or standard deviations: noise has edges everywhere
-_HIDDEN: Final = 4.5  # standard deviations above which alignment is not doubted but for a shift
 _BETTER: Final = 1.5  # ratio of correlations from which another place than alignment is believed
 _SHIFTED: Final = 1.3  # the same where alignment is not plainly wrong
 _SIMPLER: Final = 0.8  # share of the best correlation with which a simpler explanation does
@@ -74,7 +73,7 @@ def misalignment(frames: Sequence[Frame]) -> Misalignment | None:
         return None
     aligned = float(still[centre - 1 : centre + 2, centre - 1 : centre + 2].max())
     shifted = _best(still, "", (1.0, 1.0))
-    if aligned > _HIDDEN * deviation:
+    if aligned > _PLAIN * deviation:
         plain = shifted.height > _SHIFTED * aligned and max(map(abs, shifted.shift)) > _LEAST_SHIFT
         return _result(frames[0], shifted, shifted, aligned / deviation) if plain else None
     tried = [_best(found, flip, scale) for scale in _scales() for flip, found in search.correlations(scale).items()]

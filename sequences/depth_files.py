@@ -24,7 +24,7 @@ SUFFIXES: Final = (".png", ".tif", ".tiff", ".pgm", ".exr", ".npy", ".npz")
 FORMATS: Final = "16-bit PNG, TIFF and PGM, EXR and NumPy files"
 NOTHING: Final = 65504.0
 """Largest number of 16 bits with fractions. Programs write it, the largest integer, more or infinity for nothing."""
-_LEAST_MM: Final = 50.0  # median depth: nothing is 50 m away, nor 50 mm
+LEAST_MM: Final = 50.0  # median depth: nothing is 50 m away, nor 50 mm
 _KINDS: Final = {"L": "an 8-bit image", "P": "an 8-bit image", "RGB": "a colour image", "RGBA": "a colour image"}
 _WANTED: Final = "depth must be a 16-bit greyscale PNG, TIFF or PGM image, or floating point (TIFF, EXR, NumPy)"
 
@@ -163,7 +163,7 @@ def float_unit_mm(raw: RawDepth) -> float | None:
     if raw.dtype == np.uint16:
         return None
     measured = raw[np.isfinite(raw) & (raw > 0.0) & (raw < NOTHING)]
-    return 1.0 if measured.size and float(np.median(measured)) > _LEAST_MM else 1000.0
+    return 1.0 if measured.size and float(np.median(measured)) > LEAST_MM else 1000.0
 
 
 def metres(raw: RawDepth, scale_mm: float) -> npt.NDArray[np.float32]:

@@ -50,6 +50,10 @@ class Overrides:
             )
 
 
+MAX_ASPECT = 1.5
+"""Pixels are nearly square."""
+
+
 def sane(intrinsics: Intrinsics) -> bool:
     """Return whether numbers can be the intrinsics of a camera."""
     fx, fy, cx, cy = intrinsics

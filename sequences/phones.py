@@ -15,7 +15,7 @@ import numpy as np
 from modeler.sequences.depth_files import metres
 from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, resize_to_depth
 from modeler.sequences.image_folders import FoundImages
-from modeler.sequences.input_files import Node, input_errors, is_there, listed, read_tree
+from modeler.sequences.input_files import MAX_BYTES, Node, input_errors, is_there, listed, read_tree
 from modeler.sequences.intrinsics import Overrides, camera_of
 from modeler.sequences.recording import AbstractRecording
 from modeler.system.processes import install_command
@@ -24,7 +24,6 @@ from modeler.types import Camera, Frame, InputError
 
 ADVICE = install_command("phones")
 _AGAIN = "export it again"
-_MOST_BYTES = 64_000_000  # of a file in the archive
 
 
 @final
@@ -78,7 +77,7 @@ class Record3DSequence(AbstractRecording):
 
     def _content(self, name: str) -> bytes:
         with input_errors(self.path, "recording", _AGAIN):
-            if self._archive.getinfo(name).file_size > _MOST_BYTES:
+            if self._archive.getinfo(name).file_size > MAX_BYTES:
                 raise ValueError(f"{name} is larger than images are")
             return self._archive.read(name)
 
@@ -102,7 +101,7 @@ def _archive_of(path: Path, owner: object) -> zipfile.ZipFile:
 def open_record3d(path: Path, overrides: Overrides) -> Record3DSequence:
     """Open an archive of Record3D."""
     with input_errors(path, "recording", _AGAIN), open_regular(path) as file, zipfile.ZipFile(file) as archive:
-        if archive.getinfo("metadata").file_size > _MOST_BYTES:
+        if archive.getinfo("metadata").file_size > MAX_BYTES:
             raise ValueError("metadata is larger than it can be")
         names, text = set(archive.namelist()), archive.read("metadata")
     meta = Node(parse_json(text, path), path)

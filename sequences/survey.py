@@ -15,6 +15,7 @@ from PIL import Image
 from modeler.sequences.base import AbstractSequence, span
 from modeler.sequences.calibrated import flat_shares
 from modeler.sequences.colour_alignment import Misalignment, depth_edges, misalignment
+from modeler.sequences.intrinsics import MAX_ASPECT
 from modeler.types import Camera, Float32Array, Frame, InputError
 
 NEAREST_M = 0.01
@@ -41,8 +42,6 @@ USUAL_FIELD_DEG = (1.0, 135.0)
 """Fields of view of depth cameras, crops included."""
 WIDEST_FIELD_DEG = 170.0
 """No pinhole camera sees more."""
-MAX_ASPECT = 1.5
-"""Pixels are nearly square."""
 BENT = 1.5
 """Ratio of the shares on a plane from which depth is the distance along the ray: 2 to 6 in scenes with a table."""
 LEAST_FLAT = 0.15

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
-from modeler.system.regular_files import create_regular
+from modeler.system.regular_files import PIECE_BYTES, create_regular
 from modeler.types import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ _DISK_PATIENCE_S: Final = 60.0  # with a disk that takes nothing
 _STOP_S: Final = 1.0  # until Rerun notices that a viewer has been ended
 _QUEUED: Final = 100  # steps that viewers are behind at most, besides those that Rerun keeps
 _BEGINNING: Final = 4096  # bytes that must fit on the disk to begin with
-_PIECE: Final = 1 << 20  # bytes written at a time
 
 
 @final
@@ -79,7 +78,7 @@ class RecordingFile:
     def _copy(self) -> None:
         """Copy to the file what Rerun writes."""
         with open(self._source, "rb", buffering=0) as source, self._file as file:
-            while piece := source.read(_PIECE):
+            while piece := source.read(PIECE_BYTES):
                 while piece and self.error is None:
                     try:
                         written = file.write(piece)

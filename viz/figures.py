@@ -103,7 +103,6 @@ def _colour(slot: int) -> str:
 _NOMINAL: Final = np.linspace(0.0, 1.0, 201)
 _BAND: Final = 0.95
 _SQUARE_IN: Final = 4.2
-_CURVE_COLOURS: Final = ("#3b6fb6", "#e08e2b", "#4f9d69")
 _AXIS_COLOUR: Final = "#9aa3ad"
 _CONTROL_COLOUR: Final = "#b8474a"
 
@@ -172,7 +171,7 @@ def _draw_curves(axis: Axes, panel: Panel) -> None:
     if count:
         low, high = stats.binom(count, _NOMINAL).interval(_BAND)
         axis.fill_between(_NOMINAL, np.maximum(low, 0.0) / count, high / count, color="#dddddd", linewidth=0.0)
-    colours = iter(_CURVE_COLOURS * len(panel.curves))
+    colours = iter(_COLOURS[:3] * len(panel.curves))
     for curve in panel.curves:
         style = {"axis": (_AXIS_COLOUR, 0.8, "-", 2), "control": (_CONTROL_COLOUR, 1.6, "--", 4)}.get(curve.role)
         colour, width, dashes, order = style if style is not None else (next(colours), 2.0, "-", 3)

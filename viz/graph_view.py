@@ -22,7 +22,6 @@ OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
 
 _POSES: Final = 150  # largest number of poses that are all drawn; of more, every n-th
 _CAMERA_SIZE: Final = 0.1  # as a share of the distance to the object
-_CAPTION: Final = 1.0  # of captions below the object, as a share of the distance to it
 
 
 def draw_graph(step: Step) -> Drawing:
@@ -71,7 +70,7 @@ def below_ring_m(step: Step) -> Array:
     first = step.views[min(step.views)]
     towards_eye = OVER_THE_RING / np.linalg.norm(OVER_THE_RING)
     down = np.array([0.0, 1.0, 0.0]) - towards_eye[1] * towards_eye
-    return first.centroid_m + upright(first) @ down * (_CAPTION * distance_m(step) / np.linalg.norm(down))
+    return first.centroid_m + upright(first) @ down * (distance_m(step) / np.linalg.norm(down))
 
 
 def _edges(step: Step) -> Drawing:

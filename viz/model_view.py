@@ -19,8 +19,9 @@ from modeler.viz.drawings import CLEAR, POINT_SIZE, Drawing, Ellipsoids, rotated
 from modeler.viz.images import draw_outlined, stride_px
 
 _MODEL_POINTS: Final = 15_000
-_TRIANGLES: Final = 60_000
-_PLAIN: Final = 215.0  # grey of surface without colour
+TRIANGLES: Final = 60_000
+"""Of a mesh as drawn, in a recording or on a page."""
+_PLAIN: Final = (215, 215, 215)  # surface without colour
 
 
 def draw_model(step: Step) -> Drawing:
@@ -32,20 +33,20 @@ def draw_model(step: Step) -> Drawing:
     else:
         stride = math.ceil(max(len(model.points_m), 1) / _MODEL_POINTS)
         normals = model.normals[::stride]
-        colours = shaded((215, 215, 215), normals) if model.colours is None else model.colours[::stride]
+        colours = shaded(_PLAIN, normals) if model.colours is None else model.colours[::stride]
         yield entities.CLOUD, rr.Points3D(model.points_m[::stride], colors=colours, radii=POINT_SIZE)
     yield entities.MESH, mesh(model) if model is not None and meshed else CLEAR
 
 
 def mesh(model: ObjectModel) -> rr.Mesh3D:
     """Return the mesh, coarse enough for the recording to stay small; interpolated surface is tinted."""
-    colours = np.full(model.vertices_m.shape, _PLAIN) if model.vertex_colours is None else model.vertex_colours
+    colours = np.tile(_PLAIN, (len(model.vertices_m), 1)) if model.vertex_colours is None else model.vertex_colours
     colours = colours.astype(np.float64)
     if model.vertex_views is not None:
         made_up = model.vertex_views == 0
         colours[made_up] = 0.5 * (colours[made_up] + MADE_UP_RGB)
     attributes = np.concatenate([model.vertices_m, model.vertex_normals, colours], axis=1)
-    vertices, triangles = coarsened(attributes, model.triangles, _TRIANGLES)
+    vertices, triangles = coarsened(attributes, model.triangles, TRIANGLES)
     return rr.Mesh3D(
         vertex_positions=vertices[:, :3],
         vertex_normals=vertices[:, 3:6],

@@ -19,12 +19,11 @@ UNSEEN_CELLS: Final = "world/cells/unseen"
 SEEN: Final = "next/seen_percent"
 POSE_SD: Final = "next/pose_sd_deg"
 _GREY, _ORANGE = (150, 155, 165), (240, 140, 40)
-_SHOWN: Final = 8
 
 
 def draw_next(belief: Belief, found: Suggestions) -> Drawing:
     """Yield drawings of the belief about poses and surface, and of the suggested actions."""
-    lines = [f"**{found.summary}**", "", *(f"1. {each.words}" for each in found.ranked[:_SHOWN])]
+    lines = [f"**{found.summary}**", "", *(f"1. {each.words}" for each in found.best)]
     yield WORDS, rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     cells, size_m = belief.cells, 0.5 * belief.cells.cell_m
     open_ = belief.can_be_seen & ~cells.seen & ~cells.under

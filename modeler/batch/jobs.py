@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from modeler.system.processes import environment
+from modeler.system.regular_files import PIECE_BYTES
 
 BUILDER = "modeler.cli.one_job"
 """Module that builds the sequence of a job, in a process of its own."""
@@ -32,7 +33,6 @@ TRIES = 2
 ENDED = (0, 3)
 """Statuses of completed builds."""
 Standing = Literal["new", "interrupted", "done", "changed", "other", "failed"]
-_CHUNK_BYTES = 1 << 20
 _NOTE_BYTES = 1 << 24  # of a note at most
 _MOST = 1 << 31  # of a number in it
 _LINE = "modeler: "
@@ -119,7 +119,7 @@ def fingerprint(job: Job, *, content: bool) -> str:
                 digest.update(f"{status.st_mtime_ns} ".encode())
             elif path.is_file():  # a FIFO might block
                 with open(path, "rb") as file:
-                    while piece := file.read(_CHUNK_BYTES):
+                    while piece := file.read(PIECE_BYTES):
                         digest.update(piece)
         except OSError as error:
             digest.update(f"{error.errno} ".encode())

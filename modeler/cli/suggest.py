@@ -17,8 +17,6 @@ from modeler.composition.options import default
 if TYPE_CHECKING:
     from modeler.suggestion import Goal
 
-_SHOWN = 8  # of the ranked list, without --all
-
 
 @dataclass(frozen=True)
 class Suggest:
@@ -61,7 +59,7 @@ class Suggest:
         if self.json:
             print(json.dumps([each.record() for each in found.ranked], allow_nan=False, indent=1))
         else:
-            shown = found.ranked if self.all else found.ranked[:_SHOWN]
+            shown = found.ranked if self.all else found.best
             for each in () if found.reached else shown:
                 print(each.words)
         if given is not None and found.excluded:

@@ -18,9 +18,10 @@ from modeler.pipeline.joining import Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
 from modeler.runs.joining import Work, later_s, sequences_of, write_run
-from modeler.runs.known_objects import is_of_camera, known_object
+from modeler.runs.known_objects import known_object
 from modeler.runs.reopening import Part, Reopened, reopened
 from modeler.sequences import AbstractSequence, Overrides
+from modeler.sequences.calibrated import has_focal
 from modeler.tracking import Tracked, Tracker
 from modeler.types import (
     ACCEPTED,
@@ -184,7 +185,7 @@ def _camera(before: Reopened, frames: AbstractSequence) -> Mapping[str, Any] | N
     if not camera or not camera.get("fx_px"):
         return None
     stated_px = camera["fx_px"] / camera["focal_factor"]
-    return camera if is_of_camera(frames, stated_px) else None
+    return camera if has_focal(frames.frame(frames.indices[0]), stated_px) else None
 
 
 def _record(part: Part, frame: int, view: RayImage | None, reason: str) -> dict[str, Any]:

@@ -14,12 +14,12 @@ from modeler.export import RunFolder, read_model
 from modeler.export.bop import MODELS_INFO
 from modeler.fusion.symmetries import Axis, Symmetries
 from modeler.sequences import AbstractSequence, FocalFactor, RefocusedSequence
+from modeler.sequences.calibrated import has_focal
 from modeler.system.regular_files import read_json, read_regular
 from modeler.tracking.tracker import UNITS_M
 from modeler.types import InputError, ObjectModel
 
 Unit = Literal["m", "cm", "mm"]
-_ALIKE = 1e-3  # relative difference of focal lengths of one camera: files have rounded values
 
 
 @final
@@ -41,12 +41,8 @@ class KnownObject:
         """
         if self.focal is None or sequence.live:
             return sequence
-        return RefocusedSequence(sequence, self.focal) if is_of_camera(sequence, self.focal.stated_px) else sequence
-
-
-def is_of_camera(sequence: AbstractSequence, stated_px: float) -> bool:
-    """Return whether the focal length of a sequence is the stated one of a camera."""
-    return abs(sequence.frame(sequence.indices[0]).camera.fx / stated_px - 1.0) <= _ALIKE
+        same = has_focal(sequence.frame(sequence.indices[0]), self.focal.stated_px)
+        return RefocusedSequence(sequence, self.focal) if same else sequence
 
 
 def known_object(path: str | Path, unit: Unit | None = None) -> KnownObject:

@@ -13,7 +13,7 @@ from modeler.studio.capture import Capture
 from modeler.studio.capture_step import TONE, CaptureStep
 from modeler.studio.check_step import CheckStep, ExportStep
 from modeler.studio.files_step import FilesStep, ScansStep
-from modeler.studio.jobs import Job
+from modeler.studio.jobs import POLL_S, Job
 from modeler.studio.object_step import ObjectStep
 from modeler.studio.scan import Scan
 from modeler.studio.state import Studio
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 STEPS: Final = ("Files", "Capture", "Object", "Build", "Check", "Take away", "Scans")
 _WITHOUT_SCAN: Final = ("Files", "Capture", "Scans")
-_POLL_S: Final = 0.3  # between looks at what runs: words and bars need to be no fresher
 _STYLE: Final = Path(__file__).with_name("style.css")
 _DARK: Final = "background: #10343b"
 
@@ -74,7 +73,7 @@ class Page:
         self.scans = ScansStep(self, self.panels["Scans"])
         ui.keyboard(self._key, ignore=["input", "select", "textarea"])
         self.start()
-        ui.timer(_POLL_S, self._poll)
+        ui.timer(POLL_S, self._poll)
 
     def start(self) -> None:
         """Draw everything of the scan that is shown, and go to the step that follows."""

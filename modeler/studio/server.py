@@ -28,6 +28,7 @@ from nicegui import ui
 
 from modeler.batch.models import thumbnail_of
 from modeler.export import RunFolder
+from modeler.studio.jobs import POLL_S
 from modeler.studio.page import Page
 from modeler.studio.pictures import jpeg, thumbnail
 from modeler.studio.scan import Scan
@@ -170,7 +171,6 @@ def _with_headers(send: Send) -> Send:
 
 
 HOST: Final = "127.0.0.1"
-_POLL_S: Final = 0.25  # between looks at the running command
 _CLOSE_S: Final = 2  # for open connections when the server ends
 _OF_RUN: Final = ("report.html", "recording.rrd")
 _BACKLOG: Final = 128
@@ -247,7 +247,7 @@ def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
     viewers = Viewers(address, token)
     app = _application(studio, viewers)
     guarded = Guard(app, token, port)
-    nicegui.app.timer(_POLL_S, studio.queue.advance)
+    nicegui.app.timer(POLL_S, studio.queue.advance)
     logging.getLogger("nicegui").setLevel(logging.ERROR)  # it tells of slow machines
     config = uvicorn.Config(
         guarded,

@@ -98,6 +98,11 @@ class Suggestions:
     excluded: int = 0
     """Number of given candidates that are not ranked: the prior excludes them, or they show nothing."""
 
+    @property
+    def best(self) -> tuple[Suggestion, ...]:
+        """The first of them, as many as people read."""
+        return self.ranked[:8]
+
 
 def suggest(belief: Belief, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None) -> Suggestions:
     """Return what to do next.

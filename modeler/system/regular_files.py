@@ -17,7 +17,9 @@ from typing import Any, BinaryIO
 from modeler.types import InputError
 
 MAX_BYTES = 1 << 30
-"""Larger files are not read into memory at once."""
+"""Larger files are not read into memory at once, nor unpacked to more."""
+PIECE_BYTES = 1 << 20
+"""Read at a time of larger ones."""
 _KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a FIFO",

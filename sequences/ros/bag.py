@@ -26,14 +26,13 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from modeler.sequences.input_files import check_link, entries, input_errors, read_text
-from modeler.system.regular_files import open_regular
+from modeler.system.regular_files import MAX_BYTES, PIECE_BYTES, open_regular
 from modeler.types import InputError
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 
-_MOST_BYTES = 1 << 30  # of a value
 _STEP = 1_000_000  # instructions of the database between two looks at their number
 _STEPS = 100  # for one message of a small file: some seconds
 _STEPS_PER_BYTE = 1e-4  # and more in large ones: a row of ten bytes or more takes fewer than a thousand instructions
@@ -93,7 +92,7 @@ class _Work:
         """Restrict a connection that is being opened."""
         connection.authorizer = _permission
         connection.set_progress_handler(self._is_over, _STEP)
-        connection.limit(apsw.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
+        connection.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_BYTES)
 
     def _is_over(self) -> bool:
         self._left -= 1.0
@@ -120,11 +119,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 
-MAX_BYTES = 1 << 30
-"""Chunks and messages that would unpack to more are refused."""
 MAX_RATIO = 100
 """Largest compression ratio of larger files: depth images never reach it."""
-_PIECE = 1 << 20
 _ZSTD = b"\x28\xb5\x2f\xfd"  # magic bytes of its files
 
 
@@ -196,7 +192,7 @@ def check_file(path: Path) -> None:
         packed.seek(0)
         left = max(MAX_BYTES, MAX_RATIO * os.fstat(packed.fileno()).st_size)
         file = zstd.open(packed, "rb")
-        while piece := file.read(_PIECE):
+        while piece := file.read(PIECE_BYTES):
             left -= len(piece)
             if left < 0:
                 raise ValueError(f"{path.name} would unpack to more than {MAX_RATIO} times its size")

@@ -14,7 +14,8 @@ from modeler.sequences.depth_files import metres, read_depth
 from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour
 from modeler.sequences.intrinsics import sane
 from modeler.sequences.lens import Lens, lens_of_model
-from modeler.sequences.ros.bag import MAX_BYTES, from_zstd
+from modeler.sequences.ros.bag import from_zstd
+from modeler.system.regular_files import MAX_BYTES
 from modeler.types import Camera, InputError
 
 IMAGE, PACKED, CAMERA = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"

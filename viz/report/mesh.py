@@ -15,9 +15,8 @@ from modeler.export import read_model
 from modeler.export.mesh import sigma_rgb
 from modeler.system.pictures import encoded, raycaster, tensor
 from modeler.types import Array, InputError
-from modeler.viz.model_view import coarsened
+from modeler.viz.model_view import TRIANGLES, coarsened
 
-_TRIANGLES: Final = 60_000
 _ABOVE_LEFT: Final = np.array([-0.5, -0.5, -0.75])
 _STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex: 16-bit whole numbers
 
@@ -61,7 +60,7 @@ def read_mesh(path: Path) -> Mesh | None:
         attributes.append(model.vertex_colours.astype(np.float64))
     if model.vertex_sigmas_m is not None:
         attributes.append(sigma_rgb(model.vertex_sigmas_m))
-    vertices, kept = coarsened(np.concatenate(attributes, axis=1), model.triangles, _TRIANGLES)
+    vertices, kept = coarsened(np.concatenate(attributes, axis=1), model.triangles, TRIANGLES)
     used, kept = np.unique(kept, return_inverse=True)
     vertices = vertices[used]
     return Mesh(
