@@ -95,29 +95,33 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
     """
     taken: set[int] = set()
     failing: dict[int, _Failing] = {}
-    opened: AbstractSequence | None = None  # as the folder is now
-    fault = ""  # why it cannot be opened
+    coming: list[int] = []  # those in the folder that are not taken
+    opened: AbstractSequence | None = None  # only while it is needed: it has some names for each frame
+    known, fault = False, ""  # whether `coming` is as the folder is now, and why it cannot be opened
     looks = _Looks(path, patience.settle_s)
     came_s = changed_s = time.monotonic()
     while not stop():
         now, ended = time.monotonic(), (path / END).exists()  # what came before it, the look finds
         if looks.changed(now):
-            changed_s, opened = now, None  # before the next one is there: either has some names for each frame
-        if opened is None:
-            try:
-                opened, fault = open_sequence(path, overrides), ""
-            except InputError as error:  # half-written, perhaps
-                fault = str(error)
-        rest_s = max(POLL_S, REST * (time.monotonic() - now))
+            changed_s, known = now, False
         idle = now - max(came_s, changed_s) >= patience.idle_s
+        again = (ended or idle or index not in failing or now >= failing[index].again_s for index in coming)
+        if not known or (opened is None and any(again)):
+            opened = None  # before there is another
+            try:
+                opened, fault, known = open_sequence(path, overrides), "", True
+                coming = [index for index in opened.indices if index not in taken]
+            except InputError as error:  # half-written, perhaps
+                fault, known, coming = str(error), False, []
+        rest_s = max(POLL_S, REST * (time.monotonic() - now))
         settled = ended or now - changed_s >= patience.settle_s
-        coming = [] if opened is None else [(index, opened) for index in opened.indices if index not in taken]
-        for index, sequence in coming if settled else coming[:-1]:
+        for index in () if opened is None else coming if settled else coming[:-1]:
+            assert opened is not None
             before = failing.get(index, _Failing(now, now))
             frame = None
             if ended or idle or now >= before.again_s:
                 try:
-                    frame = sequence.frame(index)
+                    frame = opened.frame(index)
                 except InputError as error:
                     failing[index] = _Failing(before.since_s, 2.0 * now - before.since_s, str(error))
             if frame is None and not ended and now - before.since_s < patience.settle_s:
@@ -130,12 +134,15 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
             came_s = time.monotonic()  # which the taker may have spent long with
             if stop():
                 return
+        coming = [index for index in coming if index not in taken]
         if ended or (idle and time.monotonic() - max(came_s, changed_s) >= patience.idle_s):
-            for words in [fault] if fault else [failing[index].words for index, _ in coming if index in failing]:
+            for words in [fault] if fault else [failing[index].words for index in coming if index in failing]:
                 if not taken:
                     raise InputError(words)
                 _log.warning("%s: continuing with the frames so far", words.rstrip("."))
             return
+        if all(index in failing and failing[index].again_s > now + patience.settle_s for index in coming):
+            opened = None
         time.sleep(rest_s)
 
 
@@ -183,16 +190,20 @@ class _Looks:
         self._newer = {}
         while waiting:
             folder, is_top = waiting.pop()
-            found: list[os.DirEntry[str]] = []
-            with suppress(OSError):  # it went away between two looks
-                found = list(os.scandir(folder))
-            names, complete = {entry.name for entry in found}, self._complete.setdefault(folder, set())
-            if not complete <= names:
+            complete, there, others = self._complete.setdefault(folder, set()), 0, list[os.DirEntry[str]]()
+            with suppress(OSError), os.scandir(folder) as entries:  # it may go away between two looks
+                for entry in entries:
+                    if entry.name in complete:
+                        there += 1
+                    else:
+                        others.append(entry)
+            if there < len(complete):
+                names: set[str] = set()
+                with suppress(OSError):
+                    names.update(os.listdir(folder))
                 complete &= names
                 changed = True
-            for entry in found:
-                if entry.name in complete:
-                    continue
+            for entry in others:
                 state, is_folder = _state(entry), entry.is_dir()
                 known, since_s = before.pop(entry.path, (None, now_s))
                 if state != known:

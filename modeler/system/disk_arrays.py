@@ -49,7 +49,7 @@ class DiskArrays:
         self._file.seek(offset)
         self._file.write(np.ascontiguousarray(array).data.cast("B"))
         self._file.flush()
-        return np.frombuffer(self._chunk, array.dtype, array.size, offset).reshape(array.shape)
+        return np.ndarray(array.shape, array.dtype, self._chunk, offset)  # one object, not four
 
     def release(self) -> None:
         """Drop from memory what was read of the arrays; where it is used again, it is read again."""
@@ -77,8 +77,6 @@ def release(array: npt.NDArray[np.generic]) -> None:
     owner: object = array
     while isinstance(owner, np.ndarray):
         owner = owner.base
-    if isinstance(owner, memoryview):
-        owner = owner.obj
     if isinstance(owner, mmap.mmap) and sys.platform == "linux":
         owner.madvise(mmap.MADV_DONTNEED)
 

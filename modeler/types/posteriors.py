@@ -11,6 +11,8 @@ import numpy as np
 from modeler import se3
 from modeler.types.base import Array, Outcome
 
+_NO_POSES = np.zeros((0, 4, 4))
+_NO_WEIGHTS = np.zeros(0)  # shared: empty arrays of its own take an edge half a kilobyte
 _APART = 2.0  # standard deviations: the sum of two equal Gaussians whose means are nearer has one peak
 
 
@@ -73,9 +75,9 @@ class Posterior:
     """Overlap below which the method considers the surfaces not to match, whatever the outcome."""
     contradicted: bool = field(default=False, kw_only=True)
     """Whether the images contradict the mean more than 99 of 100 right ones, if the method can test this."""
-    samples: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    samples: Array = field(default_factory=lambda: _NO_POSES)
     """(n, 4, 4) samples of target_from_source; empty if the method draws none."""
-    weights: Array = field(default_factory=lambda: np.zeros(0))
+    weights: Array = field(default_factory=lambda: _NO_WEIGHTS)
     """(n,) weights of the samples, summing to 1."""
     modes: tuple[Mode, ...] = ()
     """The separate modes, heaviest first, with weights that sum to 1; empty for a single mode, or if unknown."""
@@ -87,7 +89,7 @@ class Posterior:
     """Log of the mean likelihood under the prior, relative to no match at all (nats)."""
     seconds: float = float("nan")
     """Wall time of the registration in s."""
-    beyond: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    beyond: Array = field(default_factory=lambda: _NO_POSES)
     """(1, 4, 4) target_from_source that matches far better and lies beyond the limits of the prior; (0, 4, 4): none."""
 
     @property
@@ -117,7 +119,7 @@ class Posterior:
 
     def without_samples(self) -> Posterior:
         """Return the posterior without its samples, most of its memory, which are not needed after acceptance tests."""
-        return replace(self, samples=np.zeros((0, 4, 4)), weights=np.zeros(0))
+        return replace(self, samples=_NO_POSES, weights=_NO_WEIGHTS)
 
 
 def are_separate(modes: Sequence[Mode]) -> bool:

@@ -123,31 +123,32 @@ _AHEAD: Final = 30  # frames: a second of a camera
 
 
 class Meter(Console):
-    """The terminal's sink of steps, which also notes time and memory."""
+    """The terminal's sink of steps, which now and then notes time and memory."""
 
     every: ClassVar = 250
-    costs: ClassVar[list[dict[str, Any]]] = []
+    costs: ClassVar[list[dict[str, Any]]] = []  # not of every step: what is measured would hold them
+    steps: ClassVar = 0
     newest: ClassVar = 0
 
     def __call__(self, event: Any) -> None:
-        """Note a step."""
+        """Note a step, if it is one of them."""
         super().__call__(event)
         if not isinstance(event, Step):
             return
         Meter.newest = max(self.newest, event.frame.index)
-        now = {"s": time.monotonic(), "cpu_s": time.process_time(), "views": len(event.views)}
-        self.costs.append({**now, "edges": len(event.edges_so_far), "last": event.last, **memory_mib()})
-        if event.last or len(self.costs) % self.every == 0:
-            print(_row(self.costs, self.every), flush=True)
+        Meter.steps += 1
+        if event.last or self.steps % self.every == 0 or not self.costs:
+            now = {"step": self.steps, "s": time.monotonic(), "cpu_s": time.process_time(), "views": len(event.views)}
+            self.costs.append({**now, "edges": len(event.edges_so_far), "last": event.last, **memory_mib()})
+            print(_row(self.costs), flush=True)
 
 
-def _row(costs: list[dict[str, Any]], every: int) -> str:
-    """Return a line on the newest step, with the time per frame since an earlier step."""
-    new, old = costs[-1], costs[max(len(costs) - 1 - every, 0)]
-    count = max(min(every, len(costs) - 1), 1)
-    spent = ((new[name] - old[name]) / count for name in ("s", "cpu_s"))
+def _row(costs: list[dict[str, Any]]) -> str:
+    """Return a line on the newest step, with the time per frame since the line before."""
+    new, old = costs[-1], costs[max(len(costs) - 2, 0)]
+    spent = ((new[name] - old[name]) / max(new["step"] - old["step"], 1) for name in ("s", "cpu_s"))
     numbers = "  ".join(f"{new[name]:7.0f}" for name in _FIELDS)
-    step = "end" if new["last"] else str(len(costs))
+    step = "end" if new["last"] else str(new["step"])
     return (
         f"{step:>6}  {numbers} MiB   {new['edges']:6d} edges   " + "  ".join(f"{s:.3f}" for s in spent) + " s a frame"
     )
