@@ -36,6 +36,7 @@ from modeler.types import (
     Solution,
     Step,
     Verdict,
+    checked,
 )
 from modeler.verdict.advice import remedies
 from modeler.views import Sensor
@@ -69,6 +70,7 @@ class Result:
         return self.verdict.trustworthy
 
 
+@checked
 def register(
     source_depth_m: npt.ArrayLike,
     target_depth_m: npt.ArrayLike,
@@ -122,6 +124,7 @@ def register(
     return modeler.register(*views, prior=known)
 
 
+@checked
 def build(
     sequence: str | Path | Iterable[Frame],
     out: str | Path | None = None,

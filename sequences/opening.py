@@ -26,7 +26,7 @@ from modeler.sequences.makers import LIBRARIES, open_camera_of
 from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.tum import open_tum
 from modeler.system.regular_files import check_regular
-from modeler.types import InputError
+from modeler.types import InputError, checked
 
 FORMATS = (
     "a folder with depth/ (BOP, TUM RGB-D, Open3D, BundleSDF, your own), organised clouds, a ROS bag, a RealSense "
@@ -35,6 +35,7 @@ FORMATS = (
 BAGS = (".bag", ".mcap", ".db3")
 
 
+@checked
 def open_sequence(path: str | Path, overrides: Overrides | None = None) -> AbstractSequence:
     """Open the sequence at a path in whichever supported format.
 

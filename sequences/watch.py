@@ -15,7 +15,7 @@ from modeler.sequences.base import FIRST, AbstractDerived, AbstractLive, Abstrac
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.opening import open_sequence
 from modeler.sequences.survey import survey
-from modeler.types import Frame, InputError
+from modeler.types import Frame, InputError, checked
 
 _log = logging.getLogger(__name__)
 
@@ -146,6 +146,7 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
         time.sleep(rest_s)
 
 
+@checked
 def watch(path: str | Path, overrides: Overrides | None = None, patience: WatchLimits | None = None) -> WatchedSequence:
     """Wait for the first frames in a folder, which need not be there yet, and return the sequence that they begin.
 

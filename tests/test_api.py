@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import inspect
 import json
 import os
 import pydoc
@@ -172,6 +173,26 @@ def test_a_live_loop_is_asked_for_a_frame_once_the_one_before_is_processed() -> 
 def test_what_is_no_sequence_of_frames_is_refused(frames: list[Any], words: str) -> None:
     with pytest.raises(modeler.InputError, match=words):
         modeler.build(frames)
+
+
+RESULTS = {"InputError", "KnownObject", "ObjectModel", "Outcome", "PoseGaussian", "Posterior", "Result", "SensorNoise",
+           "Solution", "Step", "Tracked", "Verdict"}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        *(getattr(modeler, name) for name in modeler.__all__ if name not in RESULTS),
+        *(modeler.Modeler.run, modeler.Modeler.register, modeler.Tracker.update, modeler.Frame.of, modeler.Camera.of),
+    ],
+    ids=lambda what: what.__qualname__,
+)
+def test_an_argument_of_another_type_is_refused_by_name(what: Callable[..., Any]) -> None:
+    for name, parameter in inspect.signature(what).parameters.items():
+        if name != "self" and parameter.annotation != "npt.ArrayLike | None":  # of which NumPy takes nearly all
+            wrong = object() if "None" in parameter.annotation else None
+            with pytest.raises(modeler.InputError, match=f"{what.__qualname__}: `{name}` is .*; give "):
+                what(**{name: wrong})
 
 
 def test_a_used_folder_is_refused_before_a_frame_is_taken(tmp_path: Path) -> None:

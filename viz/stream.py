@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from modeler.system.processes import check_room
-from modeler.types import Event, InputError, Step
+from modeler.types import Event, InputError, Step, checked
 from modeler.viz import entities, viewer
 from modeler.viz.destinations import RecordingFile, Shown
 
@@ -159,6 +159,7 @@ def load() -> None:
     from modeler.viz import blueprint, drawings, images, readings  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
 
+@checked
 def open_stream(
     name: str,
     *,

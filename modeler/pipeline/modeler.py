@@ -38,6 +38,7 @@ from modeler.types import (
     Searching,
     Solution,
     Step,
+    checked,
 )
 from modeler.verdict import judged
 from modeler.views import Sensor
@@ -49,6 +50,7 @@ T = TypeVar("T")
 
 
 @final
+@checked
 @dataclass(frozen=True)
 class Modeler:
     """Builds the model of an object while it turns in front of the camera.
@@ -95,6 +97,7 @@ class Modeler:
         if self.seed < 0:
             raise InputError(f"the seed {self.seed} is negative; give a whole number from 0")
 
+    @checked
     def run(
         self,
         frames: Iterable[Frame],
@@ -125,15 +128,18 @@ class Modeler:
         yield from run.refine()
         yield from run.finish()
 
+    @checked
     def start(self, scene: Scene, *, closure_expected: bool = False, depth_scale_sigma: float = 0.0) -> Run:
         """Return a run before its first frame; for the arguments see `run`."""
         measured = replace(self, sensor=self.sensor.measured(scene.range_noise))
         return Run(measured, scene, closure_expected=closure_expected, depth_scale_sigma=depth_scale_sigma)
 
+    @checked
     def prepare(self, frame: Frame, scene: Scene) -> Prepared:
         """Segment a frame and prepare it for registration."""
         return prepare(frame, scene, self.segmenter, self.sensor.measured(scene.range_noise))
 
+    @checked
     def register(self, source: RayImage, target: RayImage, prior: AbstractPrior | None = None) -> Posterior:
         """Return the posterior of target_from_source. The result depends on views, prior and seed alone.
 
@@ -152,6 +158,7 @@ class Modeler:
 
         return attempt(prior) if prior is not None else without_limits(attempt(self.prior), self.prior, attempt)
 
+    @checked
     def suggest(
         self, known: Step, candidates: Sequence[Candidate] | None = None, goal: Goal | None = None
     ) -> Suggestions:

@@ -9,7 +9,7 @@ import numpy as np
 from modeler import se3
 from modeler.priors.checks import MAX_LENGTH_M, check_parameters
 from modeler.priors.mixtures import directions
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage, checked
 
 _SMALL_DEG = 30.0  # turn up to which the limit of the centroids' offset is used as given
 LARGE_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of its surface seen before
@@ -18,6 +18,7 @@ _LEAST_SIZE_M = 1e-3  # of an object: that of a single point is 0
 _MARGIN_DEG = 5.0  # of limits around confident proposals: they bound the search, and must not truncate the posterior
 
 
+@checked
 @dataclass(frozen=True)
 class GeneralPrior(AbstractPrior):
     """Any rotation up to a limit, with the centroids of the two surfaces close to each other."""

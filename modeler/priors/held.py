@@ -11,11 +11,12 @@ from modeler import se3
 from modeler.priors.checks import ParameterError, check_parameters
 from modeler.priors.general import GeneralPrior, offset_limit_m, reach_deg, turned_offset_m
 from modeler.priors.mixtures import Alternatives, KernelMixture, defensive_mixture
-from modeler.types import AbstractPoseDensity, AbstractPrior, Edge, HandPoses, RayImage, Solution
+from modeler.types import AbstractPoseDensity, AbstractPrior, Edge, HandPoses, RayImage, Solution, checked
 
 _REGRASPED_SHARE = 0.5  # of the samples: either may be true, and the search must cover both
 
 
+@checked
 @dataclass(frozen=True)
 class HeldPrior(AbstractPrior):
     """The object moves with the hand: target_from_source = hand at target · inverse of hand at source.

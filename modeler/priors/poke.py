@@ -10,7 +10,7 @@ import numpy as np
 from modeler import se3
 from modeler.priors.checks import check_parameters
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, OnPlane, TablePrior, on_plane
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, RayImage
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, RayImage, checked
 
 _STEPS = 20  # integration steps of a push
 _PUSHES = 512  # samples of a push
@@ -33,6 +33,7 @@ class Poke:
         check_parameters(self)
 
 
+@checked
 @dataclass(frozen=True)
 class PokePrior(AbstractPrior):
     """Quasi-static pushing on a plane with friction.

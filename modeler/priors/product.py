@@ -20,6 +20,7 @@ from modeler.types import (
     RayImage,
     SharedAxis,
     Solution,
+    checked,
 )
 
 _DRAWS = 5000
@@ -31,6 +32,7 @@ _OVERSAMPLING = 4
 _CONTRADICTION_NATS = 25.0  # seven standard deviations of a Gaussian
 
 
+@checked
 @dataclass(frozen=True)
 class ProductPrior(AbstractPrior):
     """Two independent priors that both hold, such as a held object on a table."""

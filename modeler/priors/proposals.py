@@ -13,7 +13,17 @@ from modeler.priors.checks import check_parameters
 from modeler.priors.general import GeneralPrior
 from modeler.priors.mixtures import KernelMixture, defensive_mixture
 from modeler.registration.features import FeatureMatcher
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, PoseGaussian, RayImage, SharedAxis, Solution
+from modeler.types import (
+    AbstractPoseDensity,
+    AbstractPrior,
+    Array,
+    Edge,
+    PoseGaussian,
+    RayImage,
+    SharedAxis,
+    Solution,
+    checked,
+)
 
 _MIN_SIGMA_RAD, _MIN_SIGMA_M = np.radians(2.0), 0.004  # the search does not need more precision
 _INFLATION = 2.0  # factor on the graph's standard deviations, which do not include systematic errors
@@ -103,6 +113,7 @@ class PredictedProposal(AbstractPrior):
         return replace(self, known=self.known.relaxed(steps))
 
 
+@checked
 @dataclass(frozen=True)
 class VelocityPrior(AbstractProposal):
     """Constant velocity: the motion continues as between the last two frames."""
@@ -144,6 +155,7 @@ class VelocityPrior(AbstractProposal):
         return replace(self, known=self.known.learned(solution, edges), trajectory=trajectory)
 
 
+@checked
 @dataclass(frozen=True)
 class FeaturesPrior(AbstractProposal):
     """Poses on which matches of FPFH features agree, each the centre of a kernel (`modeler.registration.features`)."""

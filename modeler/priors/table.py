@@ -11,7 +11,7 @@ from modeler import se3
 from modeler.priors.checks import check_parameters
 from modeler.priors.general import AnyMotion, GeneralPrior, centroid_offset, offset_limit_m, relaxed_rotation_deg
 from modeler.priors.mixtures import across_axis
-from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage
+from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage, checked
 
 WOBBLE_DEG, WOBBLE_M = 0.2, 0.0007
 """Standard deviations of the deviation of tables from planes, and of turntables from pure rotation, in one step."""
@@ -126,6 +126,7 @@ def support(source: RayImage, target: RayImage) -> Plane | None:
     )
 
 
+@checked
 @dataclass(frozen=True)
 class TablePrior(AbstractPrior):
     """Motion in the support plane, with the plane's own uncertainty."""

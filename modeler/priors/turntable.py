@@ -25,6 +25,7 @@ from modeler.types import (
     RayImage,
     SharedAxis,
     Solution,
+    checked,
 )
 
 _REACH = 8.0  # standard deviations of the turn that are sampled
@@ -245,6 +246,7 @@ def _across(lines: Array, rng: np.random.Generator) -> Array:
     return np.stack([first, np.cross(lines, first)], axis=1).astype(np.float64)
 
 
+@checked
 @dataclass(frozen=True)
 class TurntablePrior(AbstractPrior):
     """A commanded step with a known error, about an axis that is fixed relative to the camera.

@@ -17,7 +17,7 @@ from modeler.sequences import AbstractSequence, FocalFactor, RefocusedSequence
 from modeler.sequences.calibrated import has_focal
 from modeler.system.regular_files import read_json, read_regular
 from modeler.tracking.tracker import UNITS_M
-from modeler.types import InputError, ObjectModel
+from modeler.types import InputError, ObjectModel, checked
 
 Unit = Literal["m", "cm", "mm"]
 
@@ -45,6 +45,7 @@ class KnownObject:
         return RefocusedSequence(sequence, self.focal) if same else sequence
 
 
+@checked
 def known_object(path: str | Path, unit: Unit | None = None) -> KnownObject:
     """Return the object of a run folder or a mesh file.
 

@@ -24,7 +24,7 @@ from modeler.segmentation.depth_images import (
 from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, nearest_seen_m
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
-from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation
+from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation, checked
 from modeler.views.range_noise import RangeNoise, range_noise
 from modeler.views.sparsity import closed, gap_px, interpolated, measured_share
 
@@ -38,6 +38,7 @@ _Look = tuple[Frame, Found]
 
 
 @final
+@checked
 @dataclass(frozen=True)
 class Segmenter:
     """Segments the object and its support plane in the frames of a depth camera.

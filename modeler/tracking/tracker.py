@@ -38,6 +38,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     Solution,
+    checked,
     pooled,
 )
 from modeler.views import Sensor
@@ -95,6 +96,7 @@ class Tracked:
 
 
 @final
+@checked
 @dataclass(eq=False)
 class Tracker:
     """Finds the object of a model in frames of a depth camera, and follows it.
@@ -153,6 +155,7 @@ class Tracker:
         """Rotations that map the model onto itself; looked for once a pose is uncertain, as that takes seconds."""
         return self.known_symmetries or _SYMMETRIES.find_in(self.model, np.array([0.0, 0.0, 1.0]))
 
+    @checked
     def update(self, frame: Frame) -> Tracked:
         """Return the object in the next frame.
 

@@ -4,6 +4,7 @@ Lengths are metres and angles radians unless a name says otherwise; `se3` holds 
 All values are frozen.
 """
 
+from modeler.types.arguments import checked as checked
 from modeler.types.base import Array as Array
 from modeler.types.base import BoolArray as BoolArray
 from modeler.types.base import Float32Array as Float32Array

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.types.arguments import checked
 from modeler.types.base import Array, BoolArray, InputError, Outcome
 
 Flip = Literal["", "mirrored", "upside down", "flipped top to bottom"]
@@ -25,6 +26,7 @@ _FARTHEST_M = 20.0  # that a depth camera for objects measures
 _KINDS = {"f": "floating-point numbers", "b1": "bool", "u1": "8-bit integers"}
 
 
+@checked
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera without distortion; x right, y down, z forward."""
@@ -52,6 +54,7 @@ class Camera:
             raise InputError(f"{self} is none; give a size in px, positive focal lengths and a principal point")
 
     @classmethod
+    @checked
     def of(cls, intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
         """Return the camera of images of a shape (h, w).
 
@@ -78,6 +81,7 @@ Intrinsics = Camera | npt.ArrayLike
 """A camera, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix."""
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One image of the depth camera. `Frame.of` makes one from arrays."""
@@ -117,6 +121,7 @@ class Frame:
                 )
 
     @classmethod
+    @checked
     def of(
         cls,
         depth_m: npt.ArrayLike,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from modeler.kernels import planes
-from modeler.types import BoolArray, Camera, Frame, Plane, RayImage, SensorNoise
+from modeler.types import BoolArray, Camera, Frame, Plane, RayImage, SensorNoise, checked
 from modeler.views.range_noise import RangeNoise
 from modeler.views.sparsity import ON_PLANE, closed, gap_px, measured_share, nearest_depth
 
@@ -19,6 +19,7 @@ _ALIKE = 2.0  # areas of correlated noise that err alike: measured
 _RIM_PX = 10.0  # distance from the silhouette at which errors there have fallen to 1/e: measured
 
 
+@checked
 @dataclass(frozen=True)
 class Sensor:
     """A depth camera: its noise, how errors of pixels are alike, and how its images are smoothed."""

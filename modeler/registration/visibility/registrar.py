@@ -32,6 +32,7 @@ from modeler.types import (
     Posterior,
     ViewPair,
     are_separate,
+    checked,
     pooled,
 )
 
@@ -49,6 +50,7 @@ class ModeSamples:
     """Misfit μ of a typical match (nats)."""
 
 
+@checked
 @dataclass(frozen=True)
 class VisibilityRegistrar(AbstractRegistrar):
     """The paper's likelihood with normals: surface that faces a camera is seen by it, other surface is hidden.
