@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 import sys
 import time
 import uuid
@@ -156,6 +157,8 @@ def load() -> None:
     """
     if "rerun" not in sys.modules:
         check_room(_ROOM)
+        # Rerun's and Arrow's allocators keep what other threads free, 2 kB a frame, unless they give it back at once.
+        os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
     from modeler.viz import blueprint, drawings, images, readings  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
 

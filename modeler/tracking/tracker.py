@@ -135,11 +135,7 @@ class Tracker:
     """The viewpoints of the last searches."""
 
     def __post_init__(self) -> None:
-        """Reject a model without surface, and a seed that random generators do not take.
-
-        Raises:
-            InputError: if it is one.
-        """
+        """Reject a model without surface, and a seed that random generators do not take, by an `InputError`."""
         if not self.renderer.has_surface:
             raise InputError("the model has no surface that a view saw; build it from more views")
         if self.seed < 0:
