@@ -116,7 +116,6 @@ class CalibratedSequence(AbstractDerived):
     """Another sequence, of a camera with this noise."""
 
     noise: NoiseModel
-    """The camera's noise."""
 
     def sensor(self) -> SensorNoise:
         """Return the noise at the distance of the object in the first frame."""
@@ -200,7 +199,6 @@ class RefocusedSequence(AbstractDerived):
     """Another sequence, whose camera has this focal length and depth scale."""
 
     focal: FocalFactor
-    """The focal length."""
 
     def sensor(self) -> SensorNoise | None:
         """Return the noise of its camera, with the uncertainty of its focal length; None if unknown."""

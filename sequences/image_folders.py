@@ -106,7 +106,6 @@ class FrameFiles:
     time_s: float
     """Time of capture in s."""
     depth: Path
-    """Image of depth."""
     colour: Path | None = None
     """Colour aligned to depth, in its size or finer."""
     mask: Path | None = None
@@ -234,11 +233,9 @@ class FoundImages:
     """At least one."""
     colour: Mapping[str, Path] = field(default_factory=dict)
     masks: Mapping[str, Path] = field(default_factory=dict)
-    """Masks of the object."""
     occluders: Mapping[str, Path] = field(default_factory=dict)
     """Masks of hands."""
     confidence: Mapping[str, Path] = field(default_factory=dict)
-    """Confidence of depth."""
 
 
 def images_in_folders(path: Path) -> FoundImages:

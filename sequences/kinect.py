@@ -105,7 +105,6 @@ class KinectSequence(AbstractStreams[int]):
     """The depth track of a recording, and colour brought to its pixels. Images are found by their time stamps."""
 
     file: Matroska
-    """The open file."""
     alignment: Alignment | None
     """Where the colour camera is; None without colour."""
     unit_mm: float
@@ -182,7 +181,6 @@ class Matroska:
     """A recording that is open while it is used."""
 
     path: Path
-    """The file."""
 
     def calibration(self) -> Any:
         """Return the contents of `calibration.json`, attached to the recording."""

@@ -45,7 +45,6 @@ class RunningCamera:
     newest: Callable[[], Image | None]
     """Waits for an image; None if none comes."""
     stop: Callable[[], object]
-    """Ends it."""
     failures: tuple[type[Exception], ...]
     """What the library raises."""
 
@@ -71,7 +70,6 @@ class LiveSequence(AbstractLive):
     """Images of a running camera, taken on demand until `stop()` is true."""
 
     camera: RunningCamera
-    """The running camera."""
     seen: tuple[Frame, ...]
     """Its first frame."""
     by_maker: bool = True

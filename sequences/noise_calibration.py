@@ -167,7 +167,6 @@ class NoiseBin:
     variance_m2: float
     """Variance along the ray."""
     pixels: int
-    """How many."""
 
 
 def noise_bins(depth_m: Array, middle_m: Array, camera: Camera, lateral_px: float) -> list[NoiseBin]:
@@ -273,13 +272,11 @@ class Calibration:
     """Noise of a camera measured in a static scene."""
 
     model: NoiseModel
-    """The noise."""
     bins: tuple[NoiseBin, ...]
     """Variance along the ray by distance and angle."""
     borders: tuple[DepthEdge, ...]
     """Variance across the ray at depth discontinuities."""
     frames: int
-    """Number of frames."""
 
 
 def calibrate(sequence: AbstractSequence) -> Calibration:

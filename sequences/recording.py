@@ -35,7 +35,6 @@ class AbstractRecording(AbstractSequence):
     """
 
     path: Path
-    """The folder or the file."""
     remarks: tuple[str, ...] = field(default=(), kw_only=True)
     """Assumptions and omissions of the reader, and of the format."""
     calibrated: bool = field(default=False, kw_only=True)

@@ -61,7 +61,6 @@ class Survey:
     """Contents of the frames of a sequence."""
 
     indices: tuple[int, ...]
-    """Frame numbers."""
     times_s: tuple[float, ...]
     """Times of capture in s."""
     cameras: tuple[Camera, ...]

@@ -53,7 +53,6 @@ class WatchedSequence(AbstractLive, AbstractDerived):
     overrides: Overrides = field(default_factory=Overrides)
     """Values that take precedence over the files."""
     patience: WatchLimits = field(default_factory=WatchLimits)
-    """How long to wait."""
 
     @property
     def indices(self) -> tuple[int, ...]:

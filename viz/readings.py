@@ -21,7 +21,6 @@ class Sd:
     """Standard deviations of a relative pose along its least certain axes."""
 
     rotation_deg: float
-    """Of the rotation."""
     translation_mm: float
     """Of the object's centre: that of the camera's own origin is mostly the rotation times the object's distance."""
 

@@ -43,7 +43,6 @@ class RerunStream:
     started_s: float
     """When the stream was opened, by `time.monotonic`."""
     file: RecordingFile | None = None
-    """File of the recording."""
     shown: Shown | None = None
     """What viewers are shown, which may be slow or freeze; None without a viewer."""
     advised: bool = False

@@ -43,7 +43,6 @@ class Job:
     """One sequence to build."""
 
     name: str
-    """Of its run folder."""
     sequence: str
     """Absolute path."""
     out: str

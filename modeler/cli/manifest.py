@@ -29,7 +29,6 @@ class Row:
     """A sequence of a batch."""
 
     sequence: Path
-    """Where it is."""
     place: str
     """Where it is named, for messages."""
     name: str = ""

@@ -65,9 +65,7 @@ class Pair(NamedTuple):
     """Two frames, one to be registered to the other."""
 
     source: int
-    """Frame number of the source."""
     target: int
-    """Frame number of the target."""
     offset: int
     """Frames from one to the other, in the order of the sequence."""
 
@@ -248,15 +246,11 @@ class Trial:
     """One pair registered by one method. What does not exist is NaN: a failed view has no error."""
 
     sequence: str
-    """Name of the sequence."""
     method: str
-    """Name of the method."""
     offset: int
     """Frames from one to the other."""
     source: int
-    """Frame number of the source."""
     target: int
-    """Frame number of the target."""
     outcome: str
     """How the registration ended, or why there was none."""
     usable: bool
@@ -327,9 +321,7 @@ class Summary:
     """The trials of one method on one sequence at one offset. Quantiles are over those that have an error."""
 
     sequence: str
-    """Name of the sequence."""
     method: str
-    """Name of the method."""
     offset: int
     """Frames from one to the other."""
     pairs: int

@@ -39,7 +39,6 @@ class Body:
     inertia_kg_m2: Array
     """(3, 3) moments of inertia about the centre of mass, along the axes of the mesh."""
     volume_m3: float
-    """Enclosed volume."""
 
 
 def body_of(model: ObjectModel, *, density_kg_m3: float, mass_kg: float | None = None) -> Body:

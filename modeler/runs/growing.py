@@ -61,7 +61,6 @@ class Growth:
     """Goes on building a model from a new recording."""
 
     where: ObjectOptions
-    """Where the object is in it."""
     given: Overrides
     """What is given in place of the recording's own values."""
     seed: int = 0

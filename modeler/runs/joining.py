@@ -146,7 +146,6 @@ class Work:
     graph: PoseGraph
     """Of all their frames."""
     solution: Solution
-    """Its poses."""
     shown: Sequence[Edge]
     """Edges whose best is drawn as the newest pair."""
     began_s: float

@@ -52,23 +52,18 @@ class Preset:
 
     run_folder: Path
     out: Path
-    """Folder to write."""
     purpose: Purpose
-    """Which program it is for."""
     say: Callable[[str], None]
     """Receives what is worth knowing of the files, in words."""
     overwrite: bool
-    """Replace existing files."""
     triangles: int | None
     """Simplify the mesh to so many; None: what the program and the detail need."""
     texture_px: int
-    """Side of the texture."""
     voxel_m: float | None
     """Side of a voxel; None: as in the run."""
     density_kg_m3: float | None
     """Density of the solid; None: that of water."""
     mass_kg: float | None
-    """Mass, instead of a density."""
     sequences: tuple[Path, ...]
     """Where the sequences of the run are now; none: where they were."""
 
@@ -382,9 +377,7 @@ class _Solid:
     model: ObjectModel
     """The mesh that is shown."""
     texture: Texture | None
-    """The image around it."""
     body: solids.Body
-    """Mass and inertia."""
     parts: solids.ConvexParts
     """What collides."""
 

@@ -227,7 +227,6 @@ class Reopened:
     name: str
     """Of the object or sequence."""
     report: Mapping[str, Any]
-    """The report of the run."""
     sensor: Sensor
     """Noise of the camera."""
     views: Mapping[int, RayImage]

@@ -29,9 +29,7 @@ class TrackFolder:
 
     path: Path
     model: str
-    """Path of the model, as given."""
     sequence: str
-    """Path of the sequence, as given."""
     pace: Pace = field(default_factory=Pace, init=False, repr=False)
     """When it may be written again."""
 

@@ -47,7 +47,6 @@ class Prediction:
     """The predicted effect of an action."""
 
     candidate: Candidate
-    """The action."""
     pose_nats: float
     """Predicted decrease of ½ log det of the covariance of the poses so far."""
     surface_nats: float
@@ -99,17 +98,14 @@ class Belief:
     views: Mapping[int, RayImage]
     """By frame number."""
     solution: Solution
-    """The poses."""
     edges: Sequence[Edge]
     """Every edge judged so far."""
     prior: AbstractPrior
-    """Prior of the motion."""
     stand: Stand
     """Pose of the object on its table."""
     closer: Closer = field(default_factory=Closer)
     """Selects the views with which a view is registered."""
     predictor: EdgePredictor = field(default_factory=EdgePredictor)
-    """Predicts edges."""
     ready: Callable[[RayImage], RayImage] = field(default=lambda view: view)
     """Returns a view with the images that a likelihood looks up (ten times the memory of the frame)."""
 

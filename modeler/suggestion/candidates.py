@@ -24,7 +24,6 @@ class Candidate:
     """One action, and the resulting motion of the object."""
 
     action: Action
-    """Its kind."""
     turn_deg: float = 0.0
     """Turn about the table's normal, right-handed about up."""
     poke: Poke | None = None

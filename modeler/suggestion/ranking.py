@@ -88,7 +88,6 @@ class Suggestions:
     summary: str
     """State of the model in words, and whether the goal is reached."""
     reached: bool
-    """Whether the goal is reached."""
     seen: float
     """Observed share (0..1) of the surface that turns on the table can show."""
     pose_deg: float

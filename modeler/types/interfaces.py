@@ -158,9 +158,7 @@ class ViewPair:
     """Two views to register, and all else on which the result depends."""
 
     source: RayImage
-    """One view."""
     target: RayImage
-    """Another."""
     density: AbstractPoseDensity
     """Prior density of target_from_source."""
     rng: np.random.Generator

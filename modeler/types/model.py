@@ -56,9 +56,7 @@ class Step:
     """
 
     frame: Frame
-    """The frame as read."""
     segmentation: Segmentation
-    """The segmentation of the object."""
     view: RayImage | None
     """The frame prepared for registration; None if the object was not found."""
     posteriors: tuple[Posterior, ...]
@@ -107,7 +105,6 @@ class Searching:
     """The previous view does not place a frame: others are tried."""
 
     frame: int
-    """Frame number."""
 
 
 @dataclass(frozen=True)

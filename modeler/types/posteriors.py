@@ -68,7 +68,6 @@ class Posterior:
     pose: PoseGaussian
     """target_from_source: mean and covariance; with separate modes, the heaviest one's mean and the spread of all."""
     outcome: Outcome
-    """Outcome of the registration."""
     overlap: float
     """Share (0..1) of the surface that both cameras should see, at the mean, that both do see."""
     least_overlap: float = field(default=0.0, kw_only=True)
@@ -82,7 +81,6 @@ class Posterior:
     modes: tuple[Mode, ...] = ()
     """The separate modes, heaviest first, with weights that sum to 1; empty for a single mode, or if unknown."""
     effective_samples: float = float("nan")
-    """Effective sample size."""
     pareto_k: float = float("nan")
     """Tail index of the weights; above 0.7 their mean is unreliable."""
     log_marginal_likelihood: float = float("nan")

@@ -126,7 +126,6 @@ class Edge:
     posterior: Posterior
     """The registration behind the edge."""
     kind: EdgeKind
-    """Purpose of the edge."""
     accepted: bool
     """Whether the edge takes part in the optimisation."""
     reason: Reason

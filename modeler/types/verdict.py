@@ -14,7 +14,6 @@ class FrameRecord:
     """The result of one frame."""
 
     id: int
-    """Frame number."""
     timestamp: float
     """Time of capture in s."""
     points: int
@@ -37,7 +36,6 @@ class Check:
     """A measured value, compared with its limit."""
 
     value: float
-    """The measured value."""
     limit: float
     """Beyond it, the model is not trusted."""
     at_least: bool = False

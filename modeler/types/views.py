@@ -32,9 +32,7 @@ class Camera:
     """A pinhole camera without distortion; x right, y down, z forward."""
 
     width: int
-    """Image width in px."""
     height: int
-    """Image height in px."""
     fx: float
     """Focal length along x in px."""
     fy: float

@@ -186,15 +186,10 @@ class DepthSensor:
     shadow: bool = True
     """Whether surface not lit by the projector is lost."""
     jitter: LateralJitter | None = field(default_factory=LateralJitter)
-    """Lateral jitter."""
     mixed: MixedPixels | None = field(default_factory=MixedPixels)
-    """Mixed pixels."""
     disparity: DisparityNoise | None = field(default_factory=DisparityNoise)
-    """Disparity noise."""
     grazing: GrazingLoss | None = field(default_factory=GrazingLoss)
-    """Loss of grazing surfaces."""
     loss: RandomLoss | None = field(default_factory=RandomLoss)
-    """Loss anywhere."""
 
     def __post_init__(self) -> None:
         if self.baseline_m == 0.0:

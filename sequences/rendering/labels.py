@@ -364,7 +364,6 @@ class LabelledMesh:
 
     label: Label
     mesh: Mesh
-    """In its model frame."""
     texel_m: float
     """Side of an image's pixel on the body: the footprint of a camera sample, to avoid aliasing."""
 

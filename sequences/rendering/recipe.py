@@ -23,9 +23,7 @@ class Viewpoint:
     """The camera, and its position relative to the middle of the table."""
 
     width: int = 640
-    """Image width in px."""
     height: int = 480
-    """Image height in px."""
     focal_px: float = 575.0
     """Focal length in px; the principal point is the middle of the image."""
     distance_m: float = 0.8
@@ -63,9 +61,7 @@ class Table:
     size_m: tuple[float, float] = (0.5, 0.4)
     """Width and depth in m."""
     thickness_m: float = 0.02
-    """Thickness in m."""
     rgb: tuple[int, int, int] = (150, 140, 125)
-    """Colour."""
 
     def __post_init__(self) -> None:
         if min(*self.size_m, self.thickness_m) <= 0.0:
@@ -82,7 +78,6 @@ class Wall:
     size_m: tuple[float, float] = (4.0, 3.0)
     """Width and height in m, centred at the height of the table."""
     rgb: tuple[int, int, int] = (205, 205, 200)
-    """Colour."""
 
     def __post_init__(self) -> None:
         if min(self.size_m) <= 0.0:
@@ -127,7 +122,6 @@ class Recipe:
     object: AnyShape
     """Shape of the object in its model frame, z up."""
     name: str = "rendered"
-    """Name of the sequence."""
     seed: int = 0
     """Seed of motion and noise."""
     rest_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)

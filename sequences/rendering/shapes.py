@@ -144,7 +144,6 @@ class Cylinder:
     """A cylinder about the z axis, centred at the origin."""
 
     radius_m: float
-    """Radius in m."""
     height_m: float
     """Length along z in m."""
 
@@ -165,9 +164,7 @@ class Cone:
     radius_m: float
     """Radius at the bottom in m."""
     height_m: float
-    """Height in m."""
     top_radius_m: float = 0.0
-    """Radius at the top in m."""
 
     def __post_init__(self) -> None:
         _positive(height_m=self.height_m, radius_m=max(self.radius_m, self.top_radius_m))
@@ -185,7 +182,6 @@ class Sphere:
     """A sphere about the origin."""
 
     radius_m: float
-    """Radius in m."""
 
     def __post_init__(self) -> None:
         _positive(radius_m=self.radius_m)
@@ -202,7 +198,6 @@ class Capsule:
     """A cylinder about the z axis with round ends, centred at the origin."""
 
     radius_m: float
-    """Radius in m."""
     height_m: float
     """Length along z between the centres of the ends in m."""
 
@@ -267,7 +262,6 @@ class Extrusion:
     outline_m: tuple[tuple[float, float], ...]
     """Corners x, y in m, counter-clockwise."""
     height_m: float
-    """Height in m."""
 
     def __post_init__(self) -> None:
         _positive(height_m=self.height_m)

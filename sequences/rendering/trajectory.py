@@ -25,7 +25,6 @@ class Tabletop:
     """The object is pushed over the table by hand: each step turns it by about `step_deg` and shifts it a little."""
 
     frames: int = 14
-    """Number of frames."""
     step_deg: float = 25.0
     """Mean turn about the vertical from frame to frame."""
     step_sigma_deg: float = 3.0
@@ -74,7 +73,6 @@ class Turntable:
     """The object turns about a fixed vertical axis."""
 
     frames: int = 15
-    """Number of frames."""
     step_deg: float = 24.0
     """Nominal turn from frame to frame."""
     step_sigma_deg: float = 0.5
@@ -127,7 +125,6 @@ class Hand:
     """The object is turned freely in the air, about an axis that wanders."""
 
     frames: int = 20
-    """Number of frames."""
     step_deg: float = 18.0
     """Mean turn from frame to frame."""
     step_sigma_deg: float = 3.0

@@ -89,7 +89,6 @@ class ColourSource:
     """Where colour comes from."""
 
     topic: str
-    """Topic of the images."""
     alignment: Alignment | None
     """Where their camera is; None if they have the depth camera's pixels."""
 
@@ -167,11 +166,8 @@ class RosSequence(AbstractStreams[Stamp]):
     """The depth images of one topic, and the colour images that are aligned to them."""
 
     bag: Bag
-    """The open bag."""
     depth_topic: str
-    """Topic of the depth images."""
     colour: ColourSource | None
-    """Where colour comes from."""
     unit_mm: float
     """Millimetres per unit of 16-bit depth."""
     unit: str
