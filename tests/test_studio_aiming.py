@@ -11,7 +11,7 @@ import pytest
 from modeler import se3
 from modeler.segmentation import Segmenter
 from modeler.sequences import open_sequence
-from modeler.studio.aiming import ghost, is_filled, nothing_near, suggested_turn_deg, too_far
+from modeler.studio.capture import ghost, is_filled, nothing_near, suggested_turn_deg, too_far
 from modeler.types import Camera, Frame, SensorNoise
 from modeler.views import Sensor
 

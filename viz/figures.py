@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, final
+from typing import TYPE_CHECKING, Any, Final, Literal, final
 
 import numpy as np
 from scipy import stats
@@ -15,6 +15,7 @@ from modeler.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from modeler.experiment import Trial
 
@@ -48,8 +49,13 @@ def rotation_errors(trials: Sequence[Trial]) -> bytes:
     handles = [panels[0].plot([], [], "s", color=_colour(k), label=method)[0] for k, method in enumerate(methods)]
     if handles:
         figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 6), frameon=False)
+    return png(figure)
+
+
+def png(figure: Figure, dpi: int = 150, **options: Any) -> bytes:
+    """Return a figure as a file, the same bytes for the same figure; options are those of Matplotlib."""
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=150, metadata={"Software": None})
+    figure.savefig(picture, format="png", dpi=dpi, metadata={"Software": None}, **options)
     return picture.getvalue()
 
 
@@ -155,9 +161,7 @@ def coverage_curves(panels: Sequence[Sequence[Panel]]) -> bytes:
         figure.legend(
             handles, labels, loc="outside upper center", ncols=min(len(handles), 2 * columns), frameon=False, fontsize=9
         )
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=150, bbox_inches="tight", metadata={"Software": None})
-    return picture.getvalue()
+    return png(figure, bbox_inches="tight")
 
 
 def _draw_curves(axis: Axes, panel: Panel) -> None:

@@ -17,8 +17,12 @@ from modeler.runs.compiling import compile_kernels
 
 if TYPE_CHECKING:
     from modeler.experiment import ModelScore, Pairing, Summary
+    from modeler.runs.reopening import Part
     from modeler.sequences import AbstractSequence
-    from modeler.types import AbstractRegistrar
+    from modeler.sequences.meshes import Mesh
+    from modeler.types import AbstractRegistrar, Array
+
+_SAME_M = 1e-5  # to which files of one surface agree
 
 
 @dataclass(frozen=True)
@@ -212,13 +216,12 @@ def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
     """Evaluate the models of runs, write `models.json` and `models.csv`, print a table and return the exit status."""
     from modeler.experiment import models_csv, models_json
     from modeler.export import write_atomically
-    from modeler.runs.scoring import scores_of
     from modeler.types import InputError
 
     scores, left_out = [], []
     for path in runs:
         try:
-            scores += scores_of(path, seed)
+            scores += _scores(path, seed)
         except InputError as error:
             if len(runs) == 1:
                 raise
@@ -235,6 +238,49 @@ def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
     for line in left_out:
         say(line)
     return 2 if left_out else 0
+
+
+def _scores(path: Path, seed: int) -> list[ModelScore]:
+    """Judge the model of a run by the true surface and the true poses."""
+    from modeler.experiment import Modelled, model_scores
+    from modeler.export import mesh_of, read_model
+    from modeler.fusion import Fuser
+    from modeler.runs.reopening import reopened
+
+    run = reopened(path)
+    truth, mesh = _truth(path, run.parts)
+    modelled = Modelled(
+        name=str(path),
+        model=read_model(mesh_of(path)),
+        views=run.views,
+        trajectory=run.solution.trajectory,
+        camera_from_model=truth,
+        truth=(mesh.vertices_m, mesh.triangles),
+    )
+    return model_scores(modelled, Fuser(voxel_m=run.report["settings"].get("voxel_m")), seed)
+
+
+def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
+    """Return the true camera_from_model (4, 4) by frame number, and the true surface."""
+    from modeler.sequences import true_mesh
+    from modeler.types import InputError
+
+    poses: dict[int, Array] = {}
+    meshes: list[Mesh] = []
+    for part in parts:
+        truth = part.truth()
+        if truth is None:
+            raise InputError(f"{part.sequence.name}: has no ground truth to compare with; add scene_gt.json.")
+        poses |= truth
+        meshes.append(true_mesh(part.sequence))
+    first = meshes[0].vertices_m
+    for part, mesh in zip(parts, meshes, strict=True):
+        if mesh.vertices_m.shape != first.shape or abs(mesh.vertices_m - first).max() > _SAME_M:
+            raise InputError(
+                f"{run}: {parts[0].sequence.name} and {part.sequence.name}, of which it is joined, have different true "
+                "surfaces; evaluate the runs it joins"
+            )
+    return poses, meshes[0]
 
 
 def _models_table(scores: Sequence[ModelScore]) -> list[tuple[str, ...]]:

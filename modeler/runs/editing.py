@@ -12,9 +12,9 @@ from modeler import se3
 from modeler.composition.compose import comes_back
 from modeler.export import RunFolder, RunMeta
 from modeler.graph import PoseGraph, solve
-from modeler.runs.joining import Work, sequences_of, write_run
+from modeler.runs.joining import Work, groups_of, sequences_of, write_run
 from modeler.runs.reopening import Reopened, reopened
-from modeler.types import Edge, InputError, Verdict
+from modeler.types import InputError, Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> 
     rest = {frame: pose for frame, pose in poses.items() if frame not in dropped}
     if len(rest) < 2:
         raise InputError(f"{run}: of its {len(poses)} frames {len(rest)} would be left; keep at least 2")
-    joined = _largest(rest, before.edges)
+    joined = max(groups_of(rest, before.edges).values(), key=lambda some: (len(some), -min(some)))
     if len(joined) < 2:
         raise InputError(f"{run}: no two frames are joined without those dropped; drop others")
     unconnected = tuple(sorted(rest.keys() - joined))
@@ -76,16 +76,6 @@ def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> 
     expected = _expected(before, settings.get("tolerance_mm"))
     found, verdict = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **expected)
     return Edited(found, verdict, unconnected)
-
-
-def _largest(frames: Collection[int], edges: Collection[Edge]) -> set[int]:
-    """Return the most of some frames that accepted edges join."""
-    group = {frame: {frame} for frame in frames}
-    for edge in edges:
-        if edge.accepted and edge.source in group and edge.target in group:
-            both = group[edge.source] | group[edge.target]
-            group |= dict.fromkeys(both, both)
-    return max(group.values(), key=lambda some: (len(some), -min(some)))
 
 
 def _without(run: Reopened, frames: Collection[int]) -> Reopened:

@@ -17,7 +17,7 @@ from modeler.graph import PoseGraph, solve
 from modeler.pipeline.joining import Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
-from modeler.runs.joining import Work, later_s, sequences_of, write_run
+from modeler.runs.joining import Work, groups_of, later_s, sequences_of, write_run
 from modeler.runs.known_objects import known_object
 from modeler.runs.reopening import Part, Reopened, reopened
 from modeler.sequences import AbstractSequence, Overrides
@@ -96,7 +96,8 @@ class Growth:
         new = {view.index: view for view in views.values() if view is not None and view.index in placed}
         edges = (*before.edges, *self._edges(before, new, placed))
         poses = before.solution.trajectory
-        kept = _connected(min(poses), edges)
+        ends = (frame for edge in edges for frame in (edge.source, edge.target))
+        kept = groups_of((*poses, *ends), edges)[min(poses)]
         if not kept & placed.keys():
             raise InputError(
                 f"{path}: no frame can be placed on the model of {run}; check that both show the same object"
@@ -165,17 +166,6 @@ def _nearest(before: Reopened, object_from_camera: Array, view: RayImage) -> lis
     rays = np.stack([object_from_camera[:3, 3], *(poses[frame][:3, 3] for frame in frames)]) - centre_m
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return [frames[k] for k in np.argsort(-(rays[1:] @ rays[0]), kind="stable")[:_PARTNERS]]
-
-
-def _connected(first: int, edges: Sequence[Edge]) -> set[int]:
-    """Return the frames that accepted edges connect with the first."""
-    found, size = {first}, 0
-    while len(found) > size:
-        size = len(found)
-        for edge in edges:
-            if edge.accepted and found & {edge.source, edge.target}:
-                found |= {edge.source, edge.target}
-    return found
 
 
 def _camera(before: Reopened, frames: AbstractSequence) -> Mapping[str, Any] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -150,6 +150,16 @@ class Work:
     """Edges whose best is drawn as the newest pair."""
     began_s: float
     """When the work began, by `time.perf_counter`."""
+
+
+def groups_of(frames: Iterable[int], edges: Iterable[Edge]) -> dict[int, set[int]]:
+    """Return by frame number the frames that accepted edges join with it, itself included."""
+    groups = {frame: {frame} for frame in frames}
+    for edge in edges:
+        if edge.accepted and edge.source in groups and edge.target in groups:
+            both = groups[edge.source] | groups[edge.target]
+            groups |= dict.fromkeys(both, both)
+    return groups
 
 
 def write_run(

@@ -6,7 +6,7 @@ import contextlib
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -88,23 +88,18 @@ class Preset:
         report = files.RunFolder(self.run_folder).result()
         if not report.get("poses"):
             raise InputError(f"{self.run_folder}: no frame of this run was accepted; report.json says why")
-        match self.purpose:
-            case "foundationpose":
-                return self._foundationpose()
-            case "bop":
-                return self._bop()
-            case "mujoco":
-                return self._mujoco()
-            case "urdf":
-                return self._urdf()
-            case "isaac":
-                return self._isaac()
-            case "gazebo":
-                return self._gazebo()
-            case "print":
-                return self._print()
-            case "nerfstudio" | "colmap":
-                return self._posed_images()
+        written: Mapping[Purpose, Callable[[], Checks]] = {
+            "foundationpose": self._foundationpose,
+            "bop": self._bop,
+            "mujoco": self._mujoco,
+            "urdf": self._urdf,
+            "isaac": self._isaac,
+            "gazebo": self._gazebo,
+            "print": self._print,
+            "nerfstudio": self._posed_images,
+            "colmap": self._posed_images,
+        }
+        return written[self.purpose]()
 
     def _outs(self, *, textured: bool) -> tuple[Path, ...]:
         """Return the files to write, except convex parts and scenes, whose number is unknown before."""

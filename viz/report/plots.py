@@ -11,7 +11,7 @@ import numpy as np
 from modeler import evaluation, se3
 from modeler.export.placing import ring_axes
 from modeler.types import Array, PoseGaussian
-from modeler.viz.figures import Curve, Panel, coverage_curves
+from modeler.viz.figures import Curve, Panel, coverage_curves, png
 from modeler.viz.readings import Sd, sd_of
 from modeler.viz.report.run_data import Result
 
@@ -260,9 +260,7 @@ def merged_clouds(result: Result, surfaces_m: Mapping[int, Array]) -> bytes:
     for axis, cloud in zip(bottom, slices, strict=True):
         _draw_cloud(axis, cloud, _ABOVE, slice_box_m, size=3.0)
         axis.set_title("slice at the red line, from above", fontsize=10, loc="left")
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120, metadata={"Software": None})
-    return picture.getvalue()
+    return png(figure, dpi=120)
 
 
 def _broadside(result: Result, surfaces_m: Mapping[int, Array]) -> Array:
