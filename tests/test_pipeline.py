@@ -120,13 +120,13 @@ class Oracle(AbstractRegistrar):
             assert isinstance(guess, KernelMixture)
             np.testing.assert_allclose(guess.means[0, :3, :3], self._truth(pair.source, pair.target)[:3, :3], atol=0.1)
             density = density.known
-        assert isinstance(density, AnyDensity)
+        steps = density.steps if isinstance(density, AnyDensity) else np.inf  # between segments there is no prior
         self.asked.append((pair.source.index, pair.target.index))
-        self.priors.append((pair.source.index, pair.target.index, density.steps))
+        self.priors.append((pair.source.index, pair.target.index, steps))
         target_from_source = self._truth(pair.source, pair.target)
         error = se3.exp(self.noise * SIGMAS * pair.rng.standard_normal(6))
         lost = pair.source.index in self.blind or (
-            (pair.source.index, pair.target.index) in self.apart and density.steps <= self.reach
+            (pair.source.index, pair.target.index) in self.apart and steps <= self.reach
         )
         pose = PoseGaussian(target_from_source @ error, np.diag(SIGMAS**2))
         outcome = Outcome.NO_OVERLAP if lost else Outcome.CONVERGED

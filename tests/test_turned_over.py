@@ -14,7 +14,7 @@ from modeler import se3
 from modeler.closure import Closer, MapView
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export import PairCache, Pairs
-from modeler.graph import PoseGraph, solve
+from modeler.graph import PoseGraph, Smoother, solve
 from modeler.graph.axis import steps_of
 from modeler.graph.pose_graph import Factor
 from modeler.pipeline import Modeler
@@ -32,12 +32,14 @@ from modeler.types import (
     Array,
     Edge,
     EdgeKind,
+    ElsewhereThanSegments,
     JoinsSegments,
     OpenRotation,
     Outcome,
     PoseGaussian,
     Posterior,
     RayImage,
+    Searching,
     SensorNoise,
     Solution,
     Stated,
@@ -258,3 +260,34 @@ def test_alignments_are_judged_by_the_likelihood_of_the_run(tmp_path: Path) -> N
     depth_alone = VisibilityRegistrar(VisibilityLikelihood(colour=False))
     cached = Modeler(registrar=depth_alone, cache=PairCache(Pairs(tmp_path), {}))
     assert cached.joiner(cached.tracker(State()))._visibility is depth_alone
+
+
+def test_a_pair_that_matches_by_chance_does_not_misplace_all_frames_after_it() -> None:
+    sequence = RenderedSequence(replace(RECIPE, turned_over=None, trajectory=Tabletop(6, 30.0, 1.0, shift_m=0.005)))
+    run = Modeler(prior=TablePrior(), sensor=Sensor(sequence.sensor())).start(Scene())
+    list(run.track(sequence))
+    middle_m = run.state.views[3].centroid_m
+
+    def wrong(edge: Edge) -> Edge:
+        """Turn the pair of frames 2 and 3 by 1 rad."""
+        if (edge.source < 3) == (edge.target < 3):
+            return edge
+        pose = edge.posterior.pose
+        turn = se3.exp(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
+        turn[:3, 3] = middle_m - turn[:3, :3] @ middle_m
+        posterior = replace(edge.posterior, pose=replace(pose, mean=pose.mean @ turn))
+        return replace(edge, posterior=posterior, accepted=edge.kind == "odometry")
+
+    graph = replace(run.state.graph, edges=tuple(map(wrong, run.state.graph.edges)))
+    run.state = replace(run.state, graph=graph, smoother=Smoother().to(graph))
+    truth = sequence.truth()
+    assert rotation_error_deg(run.state.solution.trajectory[3], true_motion(truth, 0, 3)) > 45.0
+    assert list(run.rejoin()) == [Searching(3)]
+    for frame, pose in run.state.solution.trajectory.items():
+        assert rotation_error_deg(pose, true_motion(truth, 0, frame)) < 3.0, frame
+    across = [one for one in run.state.graph.edges if (one.source < 3) != (one.target < 3)]
+    assert {one.kind for one in across if run.state.solution.takes_part(one)} == {"join"}
+    (reason,) = [one.reason for one in across if one.kind == "odometry"]
+    assert isinstance(reason, ElsewhereThanSegments)
+    assert abs(reason.angle_deg - np.degrees(1.0)) < 3.0
+    assert list(run.rejoin()) == []  # nothing is contradicted any more

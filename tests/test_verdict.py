@@ -138,6 +138,11 @@ def test_other_frames_see_through_what_is_in_the_wrong_place() -> None:
     assert (found.surface[:, 2] >= 1).all()
     assert len(found.free) == len(np.unique(found.free, axis=0)) > 0
     assert free_space({0: views[0]}, poses_of([0.0]), 0.005) is None  # nobody else looks
+    after = free_space(views, poses_of([*angles_deg[:3], *(angle_deg - 60.0 for angle_deg in angles_deg[3:])]), 0.005)
+    assert after is not None
+    assert after.excess > 1.0 > wrong.excess / after.excess
+    assert after.most_contradicted({frame: frame for frame in views}) == (2, 3)
+    assert after.most_contradicted({frame: -frame for frame in views}) == (3, 2)
 
 
 def test_a_part_that_one_frame_alone_shows_is_not_there() -> None:

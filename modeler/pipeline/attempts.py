@@ -142,15 +142,13 @@ class Search:
         return tuple(found for found in self.posteriors if found is first or not self._told_otherwise(found))
 
     def _told_otherwise(self, posterior: Posterior) -> bool:
-        """Return whether a registration contradicts a prior that was told, as the verdict would say (13.2)."""
-        if not posterior.usable or self.prior.unlimited() is not None:
+        """Return whether a registration contradicts a prior that was told."""
+        if not posterior.usable:
             return False
-        prior, steps = self.prior.following(posterior.target), self.state.steps(self.view.index, posterior.target)
-        with suppress(InputError):
-            density = prior.relaxed(max(steps, 2)).between(self.view, self.state.views[posterior.target])
-            means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
-            return distance_nats(density, float(density.log_prior(means).max())) > TAIL_NATS
-        return False
+        means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
+        steps = self.state.steps(self.view.index, posterior.target)
+        prior = self.prior.following(posterior.target)
+        return told_otherwise(prior, self.view, self.state.views[posterior.target], steps, means)
 
     @property
     def _probably_hidden(self) -> bool:
@@ -159,6 +157,24 @@ class Search:
         matched = any(posterior.matches for posterior in self.found.values())
         placed = self.base is not None or self.view.index in self.state.views
         return self.state.failed_searches > 0 and not (first_try or matched or placed)
+
+
+def told_otherwise(prior: AbstractPrior, source: RayImage, target: RayImage, steps: int, motions: Array) -> bool:
+    """Return whether all of some motions contradict a prior that was told, as the verdict would say (13.2).
+
+    Args:
+        prior: of the motion between two frames.
+        source: a view.
+        target: another.
+        steps: number of frames from one to the other.
+        motions: target_from_source (n, 4, 4).
+    """
+    if prior.unlimited() is not None:
+        return False
+    with suppress(InputError):
+        density = prior.relaxed(max(steps, 2)).between(source, target)
+        return distance_nats(density, float(density.log_prior(motions).max())) > TAIL_NATS
+    return False
 
 
 def _promising(posterior: Posterior) -> bool:

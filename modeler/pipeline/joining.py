@@ -336,7 +336,10 @@ class Joiner:
 
 
 def facing(target: Segment, source: Segment, target_from_source: Array, count: int) -> list[tuple[int, int]]:
-    """Return pairs of views (target, source) with the most similar viewing directions, no view twice."""
+    """Return pairs of views (target, source) with the most similar viewing directions.
+
+    No view comes twice, but the only one of a segment.
+    """
     centre_m = np.mean(
         [se3.transform(target.solution.trajectory[k], target.views[k].centroid_m[None])[0] for k in target.frames], 0
     )
@@ -350,7 +353,7 @@ def facing(target: Segment, source: Segment, target_from_source: Array, count: i
     for flat in np.argsort(-cosines, axis=None, kind="stable"):
         row, column = np.unravel_index(flat, cosines.shape)
         t, s = targets[int(row)], sources[int(column)]
-        if all(t != pair[0] and s != pair[1] for pair in pairs):
+        if all((t != pair[0] or len(targets) == 1) and (s != pair[1] or len(sources) == 1) for pair in pairs):
             pairs.append((t, s))
         if len(pairs) == count:
             break
@@ -389,6 +392,13 @@ def _angle(one: Alignment, other: Alignment) -> float:
 def _near(one: Alignment, other: Alignment) -> bool:
     """Return whether two alignments are the same within their errors."""
     return _angle(one, other) < Matcher().apart_rad
+
+
+def rejected_elsewhere(edge: Edge, solution: Solution) -> Edge:
+    """Return an edge, rejected because it contradicts how a solution aligns the segments of its views."""
+    motion = se3.inverse(edge.posterior.pose.mean) @ solution.relative(edge.target, edge.source)
+    reason = ElsewhereThanSegments(float(np.degrees(se3.rotation_angle(motion))))
+    return replace(edge, accepted=False, reason=reason)
 
 
 def _rejected(edge: Edge) -> Edge:

@@ -11,8 +11,9 @@ from modeler.closure import Closer, Placement
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import MovingGraph, estimate_focal_length, shared_noise, variance_factor
 from modeler.pipeline.attempts import Stage
-from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment
+from modeler.pipeline.joining import Joiner
 from modeler.pipeline.pairs import Prepared, Registrations, prepare, without_limits
+from modeler.pipeline.realigning import Realigner, joined
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import GeneralPrior
@@ -298,6 +299,8 @@ class Run:
         If the object was laid down differently or regrasped, the motion prior does not hold between the frames before
         and after, and all frames after are lost; among these it holds.
         """
+        realigner = Realigner(self.modeler.tracker, self.modeler.joiner, self.modeler.tolerance_m)
+        self.state = yield from realigner.realigned(self.state)
         tried: set[int] = set()
         if any(len(frames) >= _MIN_SEGMENT for frames in self.state.lost_intervals()):  # loops first, within segments
             yield from self.refine()
@@ -379,12 +382,9 @@ class Run:
     def _joined(self, segment: State) -> Iterator[Step]:
         """Join a segment with the views so far, if possible; yield steps of its frames."""
         joiner = self.modeler.joiner(self.modeler.tracker(self.state))
-        parts = [Segment(state.views, state.solution, state.graph.edges) for state in (self.state, segment)]
-        alignments = joiner.join(parts[0], parts[1])
-        joins = alignments[0].edges if alignments else ()
+        merged, joins = joined(joiner, self.state, segment)
         lost, left_out = self.state.lost, None
-        merged = self.state.merged(segment, joins) if sum(edge.accepted for edge in joins) >= MIN_JOINS else None
-        if merged is None or sum(merged.solution.takes_part(edge) for edge in joins) < MIN_JOINS:
+        if merged is None:
             left_out = NotJoined(len(segment.views))
         else:
             self.state = merged

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -149,6 +149,22 @@ class State:
     def subset(self, frames: Sequence[int]) -> State:
         """Return a state of some lost frames alone, without views or edges."""
         return State(places=self.places, lost={frame: self.lost[frame] for frame in frames}, store=self.store)
+
+    def parted(self, frames: Collection[int]) -> State | None:
+        """Return the state with some views alone and the edges between these; None if these do not connect them."""
+        edges = tuple(edge for edge in self.graph.edges if edge.source in frames and edge.target in frames)
+        views = {frame: view for frame, view in self.views.items() if frame in frames}
+        first = self.graph.first if self.graph.first in views else min(views, key=lambda frame: self.places[frame])
+        graph = PoseGraph(edges, first)
+        found = replace(
+            self,
+            graph=graph,
+            smoother=Smoother().to(graph),
+            views=views,
+            keyframes=tuple(frame for frame in self.keyframes if frame in views),
+            spans=tuple(edge for edge in self.spans if edge.source in frames and edge.target in frames),
+        )
+        return found if found.solution.trajectory.keys() >= views.keys() else None
 
     def merged(self, segment: State, joins: Sequence[Edge]) -> State:
         """Return the state merged with that of a segment of its lost frames, with the edges that join them."""

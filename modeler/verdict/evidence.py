@@ -289,7 +289,7 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
     return Check(1.0 - settled, MAX_OTHER_MODE)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FreeSpace:
     """Free-space violations of the most contradicted frames."""
 
@@ -303,6 +303,36 @@ class FreeSpace:
     """That share: points in the free space of two frames or more, and of most of those that observe them."""
     contradictions: Mapping[int, Contradictions]
     """By number of a frame beyond a limit."""
+    frames: Sequence[int]
+    """Numbers of the n frames that were compared."""
+    looks: Array
+    """(2, n, n) number of points of one frame in the free space of another, and that are on its surface."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether both shares are within their limits."""
+        return self.violations.holds and self.false_surface.holds
+
+    @property
+    def excess(self) -> float:
+        """The larger of the two shares, in units of its limit."""
+        return max(check.value / check.limit for check in (self.violations, self.false_surface))
+
+    def most_contradicted(self, places: Mapping[int, int]) -> tuple[int, int] | None:
+        """Return the two successive frames across which most surface violates free space; None if none does.
+
+        Pairs across are those of a frame up to the first with one from the second on.
+
+        Args:
+            places: by frame number, its place in order of time.
+        """
+        order = sorted(range(len(self.frames)), key=lambda k: places[self.frames[k]])
+        through, seen = (both + both.T for both in self.looks[:, order][:, :, order])
+        shares = [
+            through[:k, k:].sum() / max(through[:k, k:].sum() + seen[:k, k:].sum(), 1.0) for k in range(1, len(order))
+        ]
+        k = int(np.argmax(shares))
+        return (self.frames[order[k]], self.frames[order[k + 1]]) if shares[k] > 0.0 else None
 
 
 def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], tolerance_m: float) -> FreeSpace | None:
@@ -320,7 +350,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MAX_VIEWS)).astype(int))
     frames = [frames[k] for k in chosen]
     reaches_m = {frame: _nearest_around(views[frame]) for frame in frames}
-    looks, absent = np.zeros((len(frames), 2)), np.zeros((len(frames), 2))
+    looks, absent = np.zeros((2, len(frames), len(frames))), np.zeros((len(frames), 2))
     surface: list[Array] = []  # by frame: of it in the free space of others, and of others in its free space
     free: list[list[Array]] = [[] for _ in frames]
     for row, frame in enumerate(frames):
@@ -334,14 +364,15 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
                 found = np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
                 tally += found
                 free[column].append(pixels_of(views[other], carried_m[found[0]]))
-                looks[[row, column]] += found.sum(axis=1)  # which of the two is wrong is unknown
+                looks[:, row, column] = found.sum(axis=1)
         through, judged = tally[0], tally.sum(axis=0) >= 2
         absent[row] = np.sum(judged & (through >= 2) & (through > tally[1])), judged.sum()
         surface.append(np.column_stack([places, tally.T])[through > 0])
-    known = looks.sum(axis=1) >= _MIN_POINTS
+    through, seen = looks.sum(axis=1) + looks.sum(axis=2)  # which of the two is wrong is unknown
+    known = through + seen >= _MIN_POINTS
     if not known.any():
         return None
-    shares = np.where(known, looks[:, 0] / np.maximum(looks.sum(axis=1), 1.0), 0.0)
+    shares = np.where(known, through / np.maximum(through + seen, 1.0), 0.0)
     bare = np.where(absent[:, 1] >= _MIN_JUDGED, absent[:, 0] / np.maximum(absent[:, 1], 1.0), 0.0)
     worst, barest = int(np.argmax(shares)), int(np.argmax(bare))
     return FreeSpace(
@@ -354,6 +385,8 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
             for row, frame in enumerate(frames)
             if shares[row] > MAX_VIOLATIONS or bare[row] > MAX_FALSE_SURFACE
         },
+        frames,
+        looks,
     )
 
 
