@@ -24,7 +24,7 @@ def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) ->
     Point-to-plane distances have rows a = (p × n, n), with mean B of a aᵀ. If distances err by σ, alike within each of
     K patches, a solution from surface alone, of covariance C, is moved with the covariance (σ² / K) B⁻¹ = (σ² / K) s C.
     In the direction in which surface tells most, it tells nearly all: 1 / s is the largest eigenvalue of C B. Places of
-    colours and outlines on the model err as its surface does, so that what they tell counts alike (method, eq. 15.1).
+    colours and outlines on the model err as its surface does, so that what they tell counts alike (method, eq. 15.2).
 
     Args:
         seen: the object in the frame.
@@ -48,7 +48,7 @@ def of_the_camera(camera_from_model: Array, centre_m: Array, sigma_focal: float,
     """Return the covariance (6, 6) of ξ due to focal length and depth scale, both common to all points.
 
     A longer focal length moves the object towards the optical axis, by its distance from it; a scale of depth moves it
-    along its ray (method, eq. 15.2).
+    along its ray (method, eq. 15.3).
 
     Args:
         camera_from_model: (4, 4).

@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration import VisibilityLikelihood
+from modeler.registration.visibility.directed import DirectedLikelihood
 from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.points import FixedPattern, points_of, spread_points
 from modeler.registration.visibility.search import Search
 from modeler.tracking.rendering import COARSE_PX, MOST_PX, ModelRenderer
 from modeler.types import Array, Camera, RayImage
@@ -34,6 +36,8 @@ class Viewpoints:
     """(v, 4, 4)."""
     views: tuple[RayImage, ...]
     """The model there."""
+    centroids_m: tuple[Array, ...]
+    """(5, 3) of each view and of its halves."""
     distance_m: float
     """Of the model's centre."""
 
@@ -56,7 +60,8 @@ class Viewpoints:
         poses[:, :3, 3] = np.array([0.0, 0.0, distance_m]) - poses[:, :3, :3] @ renderer.centre_m
         views = [renderer.view(pose, camera, sensor, most_px=COARSE_PX) for pose in poses]
         kept = [number for number, view in enumerate(views) if len(view.points_m) >= _MIN_POINTS]
-        return Viewpoints(poses[kept], tuple(views[number] for number in kept), distance_m)
+        views = [views[number] for number in kept]
+        return Viewpoints(poses[kept], tuple(views), tuple(_centroids(seen) for seen in views), distance_m)
 
     def suits(self, distance_m: float) -> bool:
         """Return whether the model looks about the same at another distance."""
@@ -93,11 +98,9 @@ class ViewpointSearch:
             view: the frame, segmented.
             rng: source of all randomness.
         """
+        source = points_of(view, spread_points(view, self.coarse.points, rng))
         return _ranked(
-            [
-                self._from_viewpoint(seen, start, view, rng)
-                for start, seen in zip(viewpoints.camera_from_model, viewpoints.views, strict=True)
-            ]
+            [self._from_viewpoint(viewpoints, number, view, source, rng) for number in range(len(viewpoints.views))]
         )
 
     def again(
@@ -133,19 +136,35 @@ class ViewpointSearch:
         return _ranked(descended(near[scores > scores[:1] - RIVAL_NATS], self.fine, MOST_PX))
 
     def _from_viewpoint(
-        self, seen: RayImage, camera_from_model: Array, view: RayImage, rng: np.random.Generator
+        self, viewpoints: Viewpoints, number: int, view: RayImage, source: Array, rng: np.random.Generator
     ) -> tuple[Array, Array]:
-        """Return camera_from_model (k, 4, 4) after descent from the best turns, and log-likelihoods (k,)."""
-        pair = self.coarse.between(view, seen, rng)
+        """Return camera_from_model (k, 4, 4) after descent from the best turns at one, and log-likelihoods (k,).
+
+        Args:
+            viewpoints: around the model.
+            number: of the viewpoint.
+            view: the frame.
+            source: (n, 10) points of the frame, see `points_of`.
+            rng: source of all randomness.
+        """
+        seen, centroids_m = viewpoints.views[number], viewpoints.centroids_m[number]
+        size_m, pattern = 0.5 * (view.size_m + seen.size_m), FixedPattern.between(view, seen)
+        target = points_of(seen, spread_points(seen, self.coarse.points, rng))
+        pair = PairLikelihood(
+            DirectedLikelihood(self.coarse, source, seen, size_m, pattern),
+            DirectedLikelihood(self.coarse, target, view, size_m, pattern),
+            size_m,
+        )
         axis = seen.centroid_m / np.linalg.norm(seen.centroid_m)
-        angles, places = np.arange(self.turns) * 2.0 * np.pi / self.turns, _centroids(seen)
-        starts = np.broadcast_to(np.eye(4), (len(places), self.turns, 4, 4)).copy()
+        angles = np.arange(self.turns) * 2.0 * np.pi / self.turns
+        starts = np.broadcast_to(np.eye(4), (len(centroids_m), self.turns, 4, 4)).copy()
         facing = _aligned(view.centroid_m / np.linalg.norm(view.centroid_m), axis)[:3, :3]
         starts[..., :3, :3] = Rotation.from_rotvec(angles[:, None] * axis).as_matrix() @ facing
-        starts[..., :3, 3] = places[:, None] - starts[..., :3, :3] @ view.centroid_m
+        starts[..., :3, 3] = centroids_m[:, None] - starts[..., :3, :3] @ view.centroid_m
         starts = starts.reshape(-1, 4, 4)
         scores = pair.tempered(starts, 2.0 * self.search.blurs_m(pair)[0], stride=_STRIDE)
-        return self._descended(pair, starts[np.argsort(-scores, kind="stable")[: self.descended]], camera_from_model)
+        best = starts[np.argsort(-scores, kind="stable")[: self.descended]]
+        return self._descended(pair, best, viewpoints.camera_from_model[number])
 
     def _descended(self, pair: PairLikelihood, poses: Array, camera_from_model: Array) -> tuple[Array, Array]:
         """Return camera_from_model (k, 4, 4) after descent from poses of the pair, and log-likelihoods (k,)."""
@@ -191,6 +210,11 @@ def _ranked(found: list[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 def _aligned(one: Array, other: Array) -> Array:
     """Return the rotation (4, 4) of least angle that takes one unit vector (3,) to another."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.align_vectors(other[None], one[None])[0].as_matrix()
+    turn, axis, cosine = np.eye(4), np.cross(one, other), float(one @ other)
+    if cosine < -1.0 + 1e-9:  # half a turn about any axis across
+        axis = np.linalg.svd(one[None])[2][1]
+        turn[:3, :3] = 2.0 * np.outer(axis, axis) - np.eye(3)
+    else:
+        cross = se3.hat(axis)
+        turn[:3, :3] += cross + cross @ cross / (1.0 + cosine)
     return turn

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, final
@@ -13,7 +13,6 @@ import numpy as np
 from modeler import se3
 from modeler.fusion import SymmetryFinder
 from modeler.fusion.symmetries import Symmetries
-from modeler.kernels import point_likelihood
 from modeler.pipeline.pairs import SEGMENTED
 from modeler.priors.mixtures import KernelMixture
 from modeler.registration import VisibilityRegistrar
@@ -23,7 +22,8 @@ from modeler.registration.visibility.search import Search
 from modeler.segmentation import Scene, Segmenter
 from modeler.tracking.candidates import CandidateFinder
 from modeler.tracking.errors import free_directions, of_the_camera, of_the_model
-from modeler.tracking.rendering import FINE_PX, ModelRenderer
+from modeler.tracking.odds import log_odds, relative_weights
+from modeler.tracking.rendering import COARSE_PX, FINE_PX, MOST_PX, ModelRenderer
 from modeler.tracking.search import RIVAL_NATS, Viewpoints, ViewpointSearch
 from modeler.types import (
     AbstractPoseDensity,
@@ -55,9 +55,8 @@ _SIGMA_RAD, _SIGMA = 0.12, 0.15  # of a pose found by the search: rotation, and 
 _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames before
 _MOST_STEPS = 3.0  # over which a velocity is extrapolated
 _OVERLAP = 0.6  # least, with any rotation
-# Least number of patches of the frame or share of the model that match: of other shapes, up to 13.6 do where all fits.
-_LEAST_PATCHES, _SHOWN = 14.0, 0.3
-_PER_PATCH = np.log(2.0)  # nats for each patch of a candidate: other surface matches by chance every second time
+_DOUBT = 0.02  # probability of another object or place up to which an answer is sure
+_BEYOND_DOUBT = 30.0  # nats from which no other place is searched: twice what a wrong one reached in 87 scenes
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
 _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
 _MOST_TRIED = 3  # of the segments of a frame, the likeliest
@@ -75,7 +74,8 @@ class Tracked:
     outcome: Presence
     """`found` without knowledge of the frames before, `followed` from these, or neither.
 
-    It is `unsure` if the images leave a rotation open that is no symmetry of the model: others may match as well.
+    It is `unsure` if other objects may match as well: too little is seen, another place matches, or the images leave a
+    rotation open that is no symmetry of the model.
     """
     pose: PoseGaussian | None = None
     """camera_from_model, its covariance with the errors of model and camera; None where the object is not there."""
@@ -190,8 +190,8 @@ class Tracker:
             followed = None if view is None else self._followed(view, rng)
             if followed is not None:
                 return followed
-        views = [self._guessed(clear, mask) for mask in self.finder.masks(clear, self.renderer)]
-        return self._found([view for view in views if view is not None], rng, nothing, clear)
+        views = (self._guessed(clear, mask) for mask in self.finder.masks(clear, self.renderer))
+        return self._found((view for view in views if view is not None), rng, nothing, clear)
 
     @property
     def _follows(self) -> bool:
@@ -276,7 +276,7 @@ class Tracker:
 
     def _found(
         self,
-        views: Sequence[RayImage],
+        views: Iterable[RayImage],
         rng: np.random.Generator,
         nothing: Tracked | None = None,
         unmasked: Frame | None = None,
@@ -294,51 +294,71 @@ class Tracker:
             self._check_size(view)
             distance_m = float(np.linalg.norm(view.centroid_m)) + 0.5 * self.renderer.radius_m
             poses, scores = self.search.roughly(self._viewpoints(view, distance_m), view, rng)
-            rough += [(scores[0] + _PER_PATCH * view.patches, (poses, scores), view)] if len(poses) else []
+            if len(poses):
+                pair = self._pair(view, poses[0], rng, most_px=COARSE_PX)
+                evidence = log_odds(pair, self.registrar.search.fine_m(pair))
+                rough.append((evidence, (poses, scores), view))
+                if evidence > _BEYOND_DOUBT:
+                    break
         rough.sort(key=lambda one: -one[0])
-        absent = nothing
-        for _, poses, view in rough[:_MOST_TRIED]:
+        absent, best, least = nothing, None, -np.inf
+        for evidence, poses, view in rough[:_MOST_TRIED]:
+            if best is not None and (evidence < least or self._holds(best, view)):
+                continue  # no rival
             found = self._in_view(view, poses, rng, unmasked)
-            if found.pose is not None:
-                return found
-            absent = absent if absent is not None and absent.outcome == "not there" else found
-        assert absent is not None
-        return absent
+            if found.pose is None:
+                absent = absent if absent is not None and absent.outcome == "not there" else found
+            elif best is None:
+                best, least = found, evidence + np.log(_DOUBT)
+            else:
+                return replace(best, outcome="unsure", usable=False, reason="several places explain the image")
+        found = best or absent
+        assert found is not None
+        return found
+
+    def _holds(self, found: Tracked, view: RayImage) -> bool:
+        """Return whether what a view shows is where the object was found."""
+        assert found.pose is not None
+        centre_m = se3.transform(found.pose.mean, self.renderer.centre_m[None])[0]
+        return float(np.linalg.norm(view.centroid_m - centre_m)) < self.renderer.radius_m
 
     def _in_view(
         self, view: RayImage, rough: tuple[Array, Array], rng: np.random.Generator, unmasked: Frame | None = None
     ) -> Tracked:
         """Return the object in a view, near one of rough poses (k, 4, 4), with scores (k,), the likeliest first.
 
-        A guessed mask that has too much or too little gets a second chance, with what is near the pose found in it.
+        A guessed mask that has too much or too little gives way to what is near the likeliest pose found in it.
         """
         absent = Tracked(view.index, view.frame.time_s, "not there", reason="no view of the model fits", view=view)
         poses, scores = self.search.again(self.renderer, rough, view, self.sensor, rng)
         if not len(poses):
             return absent
+        if unmasked is not None:
+            better = self._guessed(unmasked, self.finder.near(unmasked, poses[0], self.renderer))
+            view = view if better is None else better
         likely = poses[scores > scores[0] - RIVAL_NATS][: self.registrar.max_modes]
         registered = [(self._registered(view, pose, rng), pose) for pose in likely]
         convincing = [(posterior, pose) for posterior, pose in registered if posterior.convincing]
         if not convincing:
-            best, about = registered[0]
-            if unmasked is not None and best.usable and best.overlap > _OVERLAP:
-                reached = se3.inverse(best.pose.mean) @ about
-                better = self._guessed(unmasked, self.finder.near(unmasked, reached, self.renderer))
-                if better is not None:
-                    return self._in_view(better, (reached[None], np.full(1, -np.inf)), rng)
+            best, _ = registered[0]
             reason = "the images contradict the likeliest pose" if best.usable else best.outcome.label
             return replace(absent, overlap=best.overlap, reason=reason)
         pairs = [self._pair(view, se3.inverse(posterior.pose.mean) @ pose, rng) for posterior, pose in convincing]
-        enough = [one.overlap > _OVERLAP and _enough(pair) for (one, _), pair in zip(convincing, pairs, strict=True)]
         # Again: the view from beside a pose, with which it was registered, shows less of what should be seen.
-        fits = [pair.fits(np.eye(4), self.registrar.search.fine_m(pair)) for pair in pairs]
+        finest = [self.registrar.search.fine_m(pair) for pair in pairs]
+        evidence = [log_odds(pair, fine_m) for pair, fine_m in zip(pairs, finest, strict=True)]
+        enough = [one.overlap > _OVERLAP and more > 0.0 for (one, _), more in zip(convincing, evidence, strict=True)]
+        fits = [pair.fits(np.eye(4), fine_m) for pair, fine_m in zip(pairs, finest, strict=True)]
         kept = [k for k in range(len(pairs)) if enough[k] and fits[k]]
         if not kept:
             reason = "the images contradict all poses" if any(enough) else "too little surface matches"
             return replace(absent, overlap=convincing[0][0].overlap, reason=reason)
-        weights = self._weights([pairs[k] for k in kept], view)
+        weights = relative_weights([pairs[k] for k in kept], view, finest[kept[0]])
         order = np.argsort(-weights, kind="stable")
-        return self._tracked(view, "found", [(float(weights[k]), *convincing[kept[k]]) for k in order])
+        found = self._tracked(view, "found", [(float(weights[k]), *convincing[kept[k]]) for k in order])
+        if max(evidence[k] for k in kept) < -np.log(_DOUBT):
+            return replace(found, outcome="unsure", usable=False, reason="too little surface matches")
+        return found
 
     def _check_size(self, view: RayImage) -> None:
         """Reject a model whose lengths cannot be m, as it is far larger or smaller than what the frame shows.
@@ -360,25 +380,12 @@ class Tracker:
         seen = self.renderer.view(pose, view.frame.camera, self.sensor)
         return self.registrar.register(view, seen, _near(view, _SIGMA_RAD, _SIGMA), rng=rng)
 
-    def _pair(self, view: RayImage, camera_from_model: Array, rng: np.random.Generator) -> PairLikelihood:
-        """Return the likelihood of a frame and the model in a pose (4, 4)."""
-        reached = self.renderer.view(camera_from_model, view.frame.camera, self.sensor)
+    def _pair(
+        self, view: RayImage, camera_from_model: Array, rng: np.random.Generator, most_px: float = MOST_PX
+    ) -> PairLikelihood:
+        """Return the likelihood of a frame and the model, rendered with at most so many px, in a pose (4, 4)."""
+        reached = self.renderer.view(camera_from_model, view.frame.camera, self.sensor, most_px=most_px)
         return self.registrar.likelihood.between(view, reached, rng)
-
-    def _weights(self, pairs: Sequence[PairLikelihood], view: RayImage) -> Array:
-        """Return relative weights (k,) of poses, each given as the pair of frame and model in it.
-
-        They are those of Gaussians about the means (Laplace), under the noise of the one that matches best.
-        """
-        here, fine_m = np.eye(4), self.registrar.search.fine_m(pairs[0])
-        blur_m = max(min(pair.noises_m(here, fine_m)[0] for pair in pairs), fine_m)
-        widest = np.diag(1.0 / np.repeat([1.0, view.size_m], 3) ** 2)
-        logs = [
-            pair.without_holes().tempered(here[None], blur_m)[0]
-            - 0.5 * np.linalg.slogdet(pair.curvatures(here[None], blur_m, stride=1)[0] + widest)[1]
-            for pair in pairs
-        ]
-        return np.exp(np.array(logs) - max(logs))
 
     def _tracked(
         self, view: RayImage, outcome: Presence, hypotheses: Iterable[tuple[float, Posterior, Array]]
@@ -472,15 +479,6 @@ def _near(view: RayImage, sigma_rad: float, sigma: float) -> KernelMixture:
         sigma_m=sigma * view.size_m,
         evidence=False,
     )
-
-
-def _enough(pair: PairLikelihood) -> bool:
-    """Return whether enough of a frame's surface, or of the model's that faces the camera, matches in the pose."""
-    frames, models = (
-        float(np.mean(side.classify(se3.rows(np.eye(4))) == point_likelihood.MATCHED))
-        for side in (pair.forward, pair.backward)
-    )
-    return pair.backward.image.patches * frames > _LEAST_PATCHES or models > _SHOWN
 
 
 def _of_model(motion: PoseGaussian, rendered: Array) -> PoseGaussian:
