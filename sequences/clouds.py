@@ -29,7 +29,7 @@ from modeler.types import Array, Camera, Frame, InputError
 SUFFIXES = (".pcd", ".ply")
 MAX_OFF_PX = 1.0
 """Points that lie farther (half of them) from their pixels were not seen by a pinhole camera."""
-_HEADER_BYTES = 65536
+_HEADER_BYTES = 65536  # more than headers take, comments included
 _MOST_BYTES = 1000  # a point, as text with many fields
 _LZF_RATIO = 20  # points a byte: its longest match is 264 bytes in 3, and a point has 6 at the least
 
@@ -163,7 +163,7 @@ def _intrinsics(
     return _window(clouds, intrinsics, axes, whole=whole), said
 
 
-_LEAST_Z = 1e-9
+_LEAST_Z = 1e-9  # in any unit: nearer is the camera itself
 _BEFORE = 100  # times as many points before the camera as behind it
 
 
@@ -209,8 +209,8 @@ def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
 
 
 _STEEPEST = 1e3  # no camera sees so far to the side
-_FINEST_PX, _COARSEST_PX = 5000.0, 50.0
-_BINS = 1 << 18
+_FINEST_PX, _COARSEST_PX = 5000.0, 50.0  # focal lengths between which grids are looked for
+_BINS = 1 << 18  # four to a pixel of the finest grid, over slopes of 13
 _ON_GRID = 0.7  # of the largest possible power; of points anywhere it is a few hundredths
 _OFF_GRID_PX = 0.12  # median, 0.25 if they lie anywhere
 

@@ -142,7 +142,7 @@ def depth_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-_SMOOTHER: Final = 4.0
+_SMOOTHER: Final = 4.0  # times rougher: bytes in the right order never are
 
 
 def is_swapped(raw: RawDepth) -> bool:

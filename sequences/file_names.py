@@ -60,7 +60,7 @@ def said_of_angles(numbers: Iterable[int]) -> tuple[str, ...]:
 
 
 _WIDEST_STEP: Final = 90  # degrees: views that are farther apart have no surface in common
-_STAMP_DIGITS: Final = 10
+_STAMP_DIGITS: Final = 10  # of seconds since 1970, the shortest stamp
 _STAMP: Final = re.compile(
     r"(?<![0-9])(1[0-9]{9}|1[0-9]{12}|1[0-9]{15}|1[0-9]{18}|6[0-9]{17})(?![0-9])(?:[._]([0-9]{1,9}))?"
 )

@@ -154,7 +154,7 @@ def _mask_pixels(path: Path) -> tuple[npt.NDArray[Any], bool]:
     return np.asarray(image.convert("RGB")).max(axis=2), False
 
 
-_WHITE, _VEIL, _FEW_LABELS = 192, 16, 8
+_WHITE, _VEIL, _FEW_LABELS = 192, 16, 8  # a mask is white somewhere; grades begin near black, and are many
 
 
 def is_soft(pixels: npt.NDArray[Any]) -> bool:

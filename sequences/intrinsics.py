@@ -206,7 +206,7 @@ def _from_text(path: Path) -> CameraFacts:
     return CameraFacts(found, path.name, distortion=distortion)
 
 
-_MAX_COEFFICIENT = 100.0
+_MAX_COEFFICIENT = 100.0  # of distortion; widths and heights, which may stand there, are larger
 _SCALES = ("depth_scale", "DepthMapFactor", "depth_unit_scale_factor")
 _WIDTHS, _HEIGHTS = ("width", "w", "image_width", "Camera.width"), ("height", "h", "image_height", "Camera.height")
 
@@ -296,7 +296,7 @@ def _distortion(node: Node) -> tuple[float, ...]:
     return tuple(0.0 if value is None else value.number() for value in values)
 
 
-_MOST_COEFFICIENTS = 14
+_MOST_COEFFICIENTS = 14  # as many as OpenCV has
 
 
 def _is_row(node: Node) -> bool:

@@ -87,7 +87,7 @@ _BROWN = ("plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_c
           "radtan", "radial_tangential", "opencv", "pinhole", "perspective", "none", "")  # fmt: skip
 """RealSense's library projects by one formula in its three models of Brown and Conrady, to 0.02 px."""
 _FISHEYE = ("equidistant", "fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "equi")
-_BROWN_COUNT = 8
+_BROWN_COUNT = 8  # k1 to k6, p1 and p2; thin prisms and tilted sensors are not modelled
 
 
 def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where: str) -> Lens:

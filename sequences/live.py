@@ -152,7 +152,7 @@ SCHEME = "realsense:"
 ADVICE = f"a RealSense camera is read by its maker's library; {install_command('realsense')}"
 WARM_UP = 30
 """Images after which exposure has settled."""
-TIMEOUT_MS = 5000
+TIMEOUT_MS = 5000  # a camera that gives nothing for so long is gone
 REACH_M = 16.0
 """Depth of a live camera beyond this is a measurement error; less fits 16 bits of a fine unit."""
 _TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")

@@ -106,9 +106,9 @@ def _colour(slot: int) -> str:
     return _COLOURS[slot % len(_COLOURS)]
 
 
-_NOMINAL: Final = np.linspace(0.0, 1.0, 201)
-_BAND: Final = 0.95
-_SQUARE_IN: Final = 4.2
+_NOMINAL: Final = np.linspace(0.0, 1.0, 201)  # steps of 0.5 %: a curve of 1,000 estimates has no finer ones to show
+_BAND: Final = 0.95  # of the curves of true covariances lie within
+_SQUARE_IN: Final = 4.2  # side of a panel
 _AXIS_COLOUR: Final = "#9aa3ad"
 _CONTROL_COLOUR: Final = "#b8474a"
 

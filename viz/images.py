@@ -20,8 +20,8 @@ from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, Drawing, shown_posterior
 
 _PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
-_DEPTH_PIXELS: Final = 100_000
-_JPEG_QUALITY: Final = 80
+_DEPTH_PIXELS: Final = 100_000  # the same of depth, which is drawn as points
+_JPEG_QUALITY: Final = 80  # photographs are looked at, not measured
 _DEPTH_UNITS_PER_M: Final = 1000.0  # finer units make the picture no better and the file several times larger
 _RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and small
 
@@ -109,7 +109,7 @@ MISSING, BACKGROUND, OBJECT = 0, 1, 2
 AGREES, HIDDEN, VIOLATION, NO_SAY = 0, 1, 2, 3
 """Verdicts on a point: on the measured surface, behind it, in front of it, or without a measurement."""
 
-_PROJECTED_POINTS: Final = 1_200
+_PROJECTED_POINTS: Final = 1_200  # more would hide the picture below them
 _VERDICT: Final = np.zeros(len(kernel.CLASSES), dtype=np.int8)  # by that of the likelihood
 _VERDICT[[kernel.MATCHED, kernel.UNKNOWN]] = AGREES, NO_SAY
 _VERDICT[[kernel.HIDDEN, kernel.BEHIND]] = HIDDEN

@@ -18,7 +18,7 @@ from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, POINT_SIZE, Drawing, Ellipsoids, rotated, shaded
 from modeler.viz.images import draw_outlined, stride_px
 
-_MODEL_POINTS: Final = 15_000
+_MODEL_POINTS: Final = 15_000  # of the cloud, which is recorded again at each step
 TRIANGLES: Final = 60_000
 """Of a mesh as drawn, in a recording or on a page."""
 _PLAIN: Final = (215, 215, 215)  # surface without colour
@@ -79,7 +79,7 @@ def coarsened(vertices: Array, triangles: npt.NDArray[np.int64], limit: int) -> 
     return merged, kept
 
 
-_MERGED_POINTS: Final = 60_000
+_MERGED_POINTS: Final = 60_000  # of all views, recorded once
 _RAMP_RGB: Final = ((70, 100, 255), (40, 190, 190), (255, 225, 60))  # from the first view to the last
 
 
@@ -103,7 +103,7 @@ def _merged_points(step: Step, poses: Mapping[int, Array]) -> rr.Points3D:
     )
 
 
-_POINTS: Final = 8_000
+_POINTS: Final = 8_000  # of the object in a frame, recorded for each
 
 
 def draw_tracked_model(model: ObjectModel) -> Drawing:

@@ -29,10 +29,10 @@ from modeler.viz.drawings import (
 )
 from modeler.viz.readings import worst_axis_sd
 
-_PAIR_POINTS: Final = 6_000
+_PAIR_POINTS: Final = 6_000  # of a view: a surface is seen, and the other through it
 
 
-_DRAWS: Final = 80
+_DRAWS: Final = 80  # samples, of which each is still seen by itself
 _LENGTH: Final = 1.1  # of the axes, in distances of the farthest point from the centroid: they stick out of the object
 
 
@@ -89,12 +89,12 @@ def draws(posterior: Posterior) -> Array:
     return posterior.pose.mean @ se3.exp(np.concatenate([sds, -sds]))
 
 
-_GHOSTS: Final = 20
-_GHOST_POINTS: Final = 200
-_MEAN_POINTS: Final = 1_500
+_GHOSTS: Final = 20  # samples that are drawn as a whole object
+_GHOST_POINTS: Final = 200  # of each of these
+_MEAN_POINTS: Final = 1_500  # of all modes together, which stand out against them
 _SHOWN_SD: Final = 0.12  # of the farthest point under the widest mode, as a share of its distance from the centre
 _MOST_RAD: Final = 0.25  # sd of the rotation as drawn: beyond it a magnified spread no longer looks like one
-_GHOST_LIGHT: Final = 0.55
+_GHOST_LIGHT: Final = 0.55  # of the colour of their mode
 _PATHS: Final = (
     entities.GHOSTS,
     entities.GHOST_MEANS,

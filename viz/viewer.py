@@ -27,8 +27,8 @@ from modeler.types import InputError
 _HOST: Final = "127.0.0.1"
 _LOOPBACK: Final = (_HOST, "localhost")
 _REQUEST_S: Final = 30.0  # without a byte, until a connection is closed
-_START_S: Final = 20.0
-_STOP_S: Final = 3.0
+_START_S: Final = 20.0  # until it listens, on a busy machine
+_STOP_S: Final = 3.0  # until it has ended when told to
 # Runs the viewer so that Linux kills it when the process that started it ends, however that ends (prctl, option
 # PR_SET_PDEATHSIG, survives exec). That process may have ended before the option was set.
 _DIE_WITH_PARENT: Final = """\

@@ -31,8 +31,8 @@ from modeler.types import (
     ViewPair,
 )
 
-_START_SAMPLES = 1000
-_SPACING_POINTS = 400
+_START_SAMPLES = 1000  # of the prior, from which the mean start is taken
+_SPACING_POINTS = 400  # whose median distance to their neighbours is taken
 _OPEN_ROTATION_RAD = np.pi / 2  # root mean square beyond which a mean rotation is meaningless
 _MIN_SIGMA = 1e-6  # rad or m: keeps covariances positive definite if prior or residuals vanish
 

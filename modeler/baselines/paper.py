@@ -31,7 +31,7 @@ from modeler.types import (
     ViewPair,
 )
 
-_SAMPLES, _UNIFORM_SAMPLES = 200_000, 2_000_000
+_SAMPLES, _UNIFORM_SAMPLES = 200_000, 2_000_000  # from a prior, and from everywhere
 _PILOT = 4096  # poses by which the checks are ordered
 _ANGLE_LIMIT_RAD = 2.0  # up to which rejection sampling of the rotation mostly succeeds
 _WIDENING = 1.5  # largest spread of a point's rays for the test, relative to that of the nearest point seen

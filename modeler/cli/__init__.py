@@ -70,7 +70,7 @@ _DESCRIPTION = (
 complain = partial(say, level=logging.ERROR)
 _ROOM = 7 * 2**27  # bytes of addresses that registering two frames takes, a third of them used
 _FILES = 256  # open at the same time: Rerun ends the process where it cannot open its own
-_THREAD_DIGITS = 3
+_THREAD_DIGITS = 3  # no machine has 1,000 cores to use
 _CHOICES = re.compile(r"Expected one of \(([^)]*)\)")
 _HELP_INDENT = " " * 8  # of an option's description in the parser's error box
 

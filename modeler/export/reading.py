@@ -17,8 +17,8 @@ from modeler.system.regular_files import read_regular
 from modeler.types import Array, Edge, EdgeKind, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior, Stated
 
 Test = Callable[[Any], bool]
-_FARTHEST_M, _WIDEST, _NARROWEST = 1e6, 1e9, 1e-30
-_ROUND = 1e-6
+_FARTHEST_M, _WIDEST, _NARROWEST = 1e6, 1e9, 1e-30  # of places and variances that can be computed with
+_ROUND = 1e-6  # to which rotations and directions survive being written
 
 
 def edges_of(report: Mapping[str, Any]) -> tuple[Edge, ...]:

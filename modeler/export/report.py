@@ -31,7 +31,7 @@ from modeler.types import (
 from modeler.verdict import judged
 from modeler.verdict.spreads import total_depth_scale_sigma
 
-_SCHEMA = 2
+_SCHEMA = 2  # of report.json (docs/files.md)
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
 _FREE_RAD = np.radians(8.0)  # twice this is the usual step between views: whether there was one, the edge does not say
 _FREE_M = 0.01  # surfaces of a hand-sized object are then visibly apart

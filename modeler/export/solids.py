@@ -24,7 +24,7 @@ HULL_TRIANGLES = 500
 # own settings and 8000 triangles, 70 parts in five minutes.
 PART_TRIANGLES = 1_500
 """Triangles of the mesh from which convex parts are found."""
-_CONCAVITY = 0.08
+_CONCAVITY = 0.08  # the threshold of CoACD: how concave a part may stay
 _SEARCH: Mapping[str, Any] = {"resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
 _LEAST_AREA_M2 = 1e-12  # of a triangle: (1 µm)², below the resolution of a 32-bit file at a distance of 10 m
 
@@ -392,7 +392,7 @@ class Settled:
         return self.speed_m_s < 0.01
 
 
-_SECONDS = 2.0
+_SECONDS = 2.0  # in which an object that is put down has come to rest
 
 
 def settled_in_mujoco(scene: Path) -> Settled:

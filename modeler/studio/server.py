@@ -173,7 +173,6 @@ def _with_headers(send: Send) -> Send:
 HOST: Final = "127.0.0.1"
 _CLOSE_S: Final = 2  # for open connections when the server ends
 _OF_RUN: Final = ("report.html", "recording.rrd")
-_BACKLOG: Final = 128
 _VIEWER_S: Final = 20.0  # for the viewer's largest file, of 40 MB
 _VIEWER_FILE: Final = re.compile(r"[\w.-]{0,64}")
 _ELSEWHERE: Final = re.compile(rb"<link[^>]*https://[^>]*>")
@@ -289,7 +288,7 @@ def _listening(port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((HOST, port))
-        listening.listen(_BACKLOG)
+        listening.listen()
     except (OSError, OverflowError) as error:
         listening.close()
         raise InputError(f"`port` {port}: cannot be used ({error}); give another one, or none") from error

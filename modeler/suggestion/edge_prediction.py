@@ -33,7 +33,7 @@ EVEN_ODDS_DEG, ODDS_DEG = 106.0, 21.0
 e-fold: a logistic fit to 475 steps over 48 rendered shapes of the tuning half, 42 of which failed."""
 TURNS_RAD: Final = np.radians(3.0) * np.arange(-60, 60)
 """Turns from the true pose about the table's normal, a posterior's width apart, for the likelihood."""
-_TRUE: Final = 60
+_TRUE: Final = 60  # index of the true pose among them
 _MODE_TEMPER: Final = 0.3
 """Tempering of the predicted likelihood between modes, so that the true mode's mass is right on average.
 

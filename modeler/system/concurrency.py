@@ -13,7 +13,7 @@ from typing import TypeVar
 S = TypeVar("S")
 T = TypeVar("T")
 
-_NO_TIME_S = 0.01
+_NO_TIME_S = 0.01  # no one notices less
 
 
 @dataclass

@@ -11,7 +11,7 @@ from modeler.types import BoolArray, Camera, Float32Array
 ON_PLANE = 25.0  # measurements to which a plane is fitted
 _UNLIKELY = 0.01  # probability that random loss leaves a hole of the radius of `gap_px`
 _LEAST = 0.01  # least share; of fewer measurements no more than a few would be in reach of each other
-_WIDE_PX = 10
+_WIDE_PX = 10  # grids of measurements are no coarser
 
 
 def measured_share(measured: BoolArray, within: BoolArray | None = None) -> float:

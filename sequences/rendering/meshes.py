@@ -116,8 +116,8 @@ def inside(mesh: Mesh, points_m: Array) -> BoolArray:
     return found.numpy() > 0.5
 
 
-_COARSE_M, _FINE_M = 0.01, 0.001
-_SKIN_M = 1e-5
+_COARSE_M, _FINE_M = 0.01, 0.001  # longest edges of triangles near a cut, and at it
+_SKIN_M = 1e-5  # off the surface: points on it are neither inside nor outside
 
 
 def outer_surface(mesh: Mesh) -> Mesh:

@@ -25,7 +25,7 @@ from modeler.sequences.rendering.shapes import Box, placement
 from modeler.sequences.rendering.trajectory import Hand
 from modeler.types import Array, Camera, Frame, InputError, SensorNoise
 
-_WALL_THICKNESS_M = 0.05
+_WALL_THICKNESS_M = 0.05  # any: only its front is seen
 
 
 def surroundings(recipe: Recipe) -> Mesh:

@@ -190,13 +190,13 @@ for (const button of document.querySelectorAll('.mask button'))
 large.onclick = () => large.close();
 """
 _SIZE: Final = (150, 200)  # height and width in px
-_MASK_SIZE: Final = (360, 480)
+_MASK_SIZE: Final = (360, 480)  # as large as it has room beside its words
 _MANY: Final = 100  # frames, beyond which those are large alone of which something is doubtful
 _MARKS_RGB: Final = ((31, 143, 155), (217, 115, 13), (200, 69, 63))
 """Of free space with surface of others, of surface in the free space of others, and of false surface."""
 _COVER: Final = 0.75  # of a mark over the picture
-_JPEG_QUALITY: Final = 82
-_BACKGROUND: Final = 250
+_JPEG_QUALITY: Final = 82  # a page may hold a hundred
+_BACKGROUND: Final = 250  # grey level around a picture of another shape, as the page has it
 _ROOM: Final = 0.3  # around the object, as a share of its size
 _DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
 

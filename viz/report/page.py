@@ -26,7 +26,7 @@ from modeler.viz.report.cards import data_address, mask_cards, pair_cards, thumb
 from modeler.viz.report.mesh import Mesh, portrait, read_mesh, scene
 from modeler.viz.report.run_data import Result, Row, recorded, surfaces
 
-_SHAPE_POINTS: Final = 6_000
+_SHAPE_POINTS: Final = 6_000  # a silhouette needs no more
 _CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
 _SYMMETRIES: Final = (
     "Rotations that map the model onto itself: in any two of these poses it looks the same, so that a pose estimator "
