@@ -390,9 +390,6 @@ def true_mesh(sequence: AbstractSequence) -> Mesh:
 
     That is `model.ply` of the sequence, in m, as the renderer writes it; else, of a BOP scene, the model of its object
     in the dataset's `models` folder, in mm.
-
-    Raises:
-        InputError: if there is none or it cannot be read.
     """
     if sequence.model_path is not None:
         return read_mesh(sequence.model_path, 1.0)

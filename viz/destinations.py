@@ -34,11 +34,7 @@ class RecordingFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Create the file, or empty it.
-
-        Raises:
-            InputError: if it cannot be written.
-        """
+        """Create the file, or empty it."""
         self.path = path
         self.error: OSError | None = None
         """Why the file is cut off, if it is."""

@@ -92,9 +92,5 @@ def _of_build(run: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
 
 
 def write_models(out: Path) -> None:
-    """Write the list of the models in a folder.
-
-    Raises:
-        InputError: if it cannot be written.
-    """
+    """Write the list of the models in a folder."""
     write_table(out / TABLE, models_in(out))

@@ -26,9 +26,6 @@ def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False,
         content: all of it.
         lasting: wait until it is on the disk, for safety against power cuts.
         tidy: remove partial files of killed processes, by listing the folder.
-
-    Raises:
-        InputError: if the file cannot be written.
     """
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content  # names need not be text
     part = path.with_name(f".{path.name}.{os.getpid()}{PART}")

@@ -54,11 +54,7 @@ _COLUMNS = {
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as a table; missing values are null.
-
-    Raises:
-        InputError: if the file cannot be written.
-    """
+    """Write rows as a table; missing values are null."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

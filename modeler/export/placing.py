@@ -81,9 +81,6 @@ class Placement:
         Args:
             out: the mesh; the sidecar is `pose_file(out)`.
             unit: in which its coordinates are written.
-
-        Raises:
-            InputError: if the file cannot be written.
         """
         content: dict[str, Any] = {
             "schema": 1,

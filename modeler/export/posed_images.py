@@ -101,9 +101,6 @@ def write_nerfstudio(data: PosedImages, folder: Path) -> None:
     """Write `transforms.json` with RGBA images, masks, depth in mm and initial points.
 
     Cameras are OpenGL's (x right, y up, z backward), lengths are m.
-
-    Raises:
-        InputError: if a file cannot be written.
     """
     cameras = {k: _nerfstudio_camera(frame.camera) for k, frame in data.frames.items()}
     alike = len({json.dumps(camera) for camera in cameras.values()}) == 1
@@ -141,9 +138,6 @@ def write_colmap(data: PosedImages, folder: Path, tolerance_m: float) -> int:
     """Write RGBA images, masks, and a sparse model as text and binary, and return its number of points.
 
     Its points are those of the surface that a frame sees, and their observations are projections, no matched features.
-
-    Raises:
-        InputError: if a file cannot be written.
     """
     numbers: dict[Camera, int] = {}
     images: list[_Image] = []

@@ -141,11 +141,7 @@ class RunFolder:
         return path if path.exists() or not Path(stored).exists() else Path(stored)
 
     def report(self) -> dict[str, Any]:
-        """Return the report in the folder.
-
-        Raises:
-            InputError: if there is none or it cannot be read.
-        """
+        """Return the report in the folder."""
         path = self.path / _REPORT
         try:
             os.lstat(path)
@@ -196,11 +192,7 @@ class RunFolder:
         return report.get("complete") is True and not self.pairs.folder.exists() and not self.changed_frames(meta)
 
     def changed_frames(self, meta: RunMeta) -> tuple[str, ...]:
-        """Return in words which frames are new, other ones, or gone since a run was made; none where that is not known.
-
-        Raises:
-            InputError: if its report cannot be read.
-        """
+        """Return in words which frames are new, others, or gone since a run was made; none where that is not known."""
         before = self.report().get("digests") if (self.path / _REPORT).exists() else None
         if not isinstance(before, dict) or not before or not meta.digests:
             return ()
@@ -213,19 +205,11 @@ class RunFolder:
         return tuple(f"{_listed(names)} {what}" for what, names in kinds.items() if names)
 
     def scene_frames(self) -> tuple[int, ...]:
-        """Return the numbers of the frames that the scene was learned from; none where that is not known.
-
-        Raises:
-            InputError: if the report cannot be read.
-        """
+        """Return the numbers of the frames that the scene was learned from; none where that is not known."""
         return tuple(self.result().get("scene_frames") or ()) if (self.path / _REPORT).exists() else ()
 
     def changed_versions(self, meta: RunMeta) -> tuple[str, ...]:
-        """Return the packages, each with its version, with which a run was begun that is to be resumed with others.
-
-        Raises:
-            InputError: if its report cannot be read.
-        """
+        """Return the packages, each with its version, with which a run was begun that is to be resumed with others."""
         if not (self.path / _REPORT).exists():
             return ()
         before = self.report().get("versions")
@@ -235,11 +219,7 @@ class RunFolder:
         )
 
     def write(self, step: Step, meta: RunMeta) -> dict[str, Any]:
-        """Bring the folder up to date and return the report; nothing if the step is skipped.
-
-        Raises:
-            InputError: if a file cannot be written.
-        """
+        """Bring the folder up to date and return the report; nothing if the step is skipped."""
         if not step.last and (len(step.frames_so_far) < self.already or self.pace.rests):
             return {}
         began_s = time.monotonic()

@@ -221,11 +221,7 @@ class PhysicsFiles:
 
 
 def write_parts(files: PhysicsFiles, parts: ConvexParts) -> None:
-    """Write convex parts as OBJ files without normals.
-
-    Raises:
-        InputError: if a file cannot be written.
-    """
+    """Write convex parts as OBJ files without normals."""
     for number, (vertices_m, triangles) in enumerate(parts.meshes):
         lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices_m]
         lines += [f"f {a} {b} {c}" for a, b, c in triangles + 1]
@@ -233,11 +229,7 @@ def write_parts(files: PhysicsFiles, parts: ConvexParts) -> None:
 
 
 def write_mjcf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
-    """Write the object as a free body, and a scene that puts it on a plane.
-
-    Raises:
-        InputError: if a file cannot be written.
-    """
+    """Write the object as a free body, and a scene that puts it on a plane."""
     name, count = files.name, len(parts.meshes)
     xx, yy, zz, xy, xz, yz = _six(body.inertia_kg_m2)
     friction = _numbers(np.array(FRICTION))
@@ -282,11 +274,7 @@ def write_mjcf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
 
 
 def write_urdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
-    """Write the object as a robot of one link.
-
-    Raises:
-        InputError: if the file cannot be written.
-    """
+    """Write the object as a robot of one link."""
     xx, yy, zz, xy, xz, yz = (f"{value:.8g}" for value in _six(body.inertia_kg_m2))
     collisions = "".join(
         f'    <collision><geometry><mesh filename="{files.part(k).name}"/></geometry></collision>\n'
@@ -313,11 +301,7 @@ def write_urdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
 
 
 def write_sdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
-    """Write the object as a model of Gazebo: SDF with its `model.config`. Meshes are found relative to it.
-
-    Raises:
-        InputError: if a file cannot be written.
-    """
+    """Write the object as a model of Gazebo: SDF with its `model.config`. Meshes are found relative to it."""
     name = files.name
     xx, yy, zz, xy, xz, yz = (f"{value:.8g}" for value in _six(body.inertia_kg_m2))
     mesh = "<geometry><mesh><uri>{}</uri></mesh></geometry>".format

@@ -52,9 +52,6 @@ def known_object(path: str | Path, unit: Unit | None = None) -> KnownObject:
     Args:
         path: a run folder, or a mesh (PLY, OBJ, GLB, STL).
         unit: of lengths in the file; None: m, or mm for a model of BOP, which `models_info.json` lies beside.
-
-    Raises:
-        InputError: if there is no model, or it cannot be read.
     """
     path = Path(path)
     if path.is_dir():

@@ -68,11 +68,7 @@ class Preset:
     """Where the sequences of the run are now; none: where they were."""
 
     def write(self) -> Checks:
-        """Write the files, read them back, and return the checks.
-
-        Raises:
-            InputError: if something cannot be read or written.
-        """
+        """Write the files, read them back, and return the checks."""
         inputs = run_inputs([self.run_folder], self.sequences)
         check_folder(self.out, inputs)
         if self.out.suffix.lower() in files.FORMATS:

@@ -196,21 +196,13 @@ def _overrides(settings: Mapping[str, Any]) -> Overrides:
 
 
 def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | None) -> AbstractSequence:
-    """Return a sequence with the calibration of its camera, as files with its noise and focal length have it.
-
-    Raises:
-        InputError: if a file cannot be read.
-    """
+    """Return a sequence with the calibration of its camera, as files with its noise and focal length have it."""
     sequence = sequence if camera is None else RefocusedSequence(sequence, read_focal_factor(camera))
     return sequence if sensor is None else CalibratedSequence(sequence, read_noise(sensor))
 
 
 def estimated_camera(file: Path | None) -> dict[str, float | str] | None:
-    """Return the calibration in a camera file as in report.json; None without one.
-
-    Raises:
-        InputError: if it cannot be read.
-    """
+    """Return the calibration in a camera file as in report.json; None without one."""
     return None if file is None else read_focal_factor(file).values()
 
 

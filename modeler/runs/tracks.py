@@ -50,11 +50,7 @@ class TrackFolder:
             raise InputError(f"{self.path}: not empty; choose another `out`, or give `overwrite`")
 
     def write(self, found: Sequence[Tracked], *, last: bool = False) -> None:
-        """Bring the files up to date.
-
-        Raises:
-            InputError: if a file cannot be written.
-        """
+        """Bring the files up to date."""
         if self.pace.rests and not last:
             return
         began_s = time.monotonic()

@@ -48,9 +48,6 @@ def write_gallery(
         rows: one a sequence, as the list of models has them.
         pictures: JPEG by name, of those that have a model.
         links: addresses by name, relative to the page.
-
-    Raises:
-        InputError: if the file cannot be written.
     """
     models = [
         {

@@ -27,9 +27,6 @@ def write_track_page(folder: Path, out: Path, centre_m: Array) -> None:
         folder: of the track, with `poses.json` and, for pictures, `recording.rrd`.
         out: file to write.
         centre_m: (3,) the object's centre in the model's frame, at which the uncertainty of its place is stated.
-
-    Raises:
-        InputError: if the file cannot be written.
     """
     track = json.loads((folder / "poses.json").read_text())
     poses, rows = track["poses"], recorded(folder / "recording.rrd")
