@@ -354,7 +354,7 @@ def test_mesh_that_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> Non
         ("broken.ply", "a.ply", "broken.ply"),
         ("good.ply", "a.fbx", "unknown mesh format '.fbx'; use .ply, .obj, .glb, .stl"),
         ("good.ply", "a", "a: no suffix selects the mesh format; use .ply"),
-        ("good.ply", "file/a.obj", "cannot be made"),
+        ("good.ply", "file/a.obj", "cannot be written"),
     ):
         with pytest.raises(InputError, match=words) as caught:
             write_mesh(read_model(mesh_of(tmp_path / source)), tmp_path / out)
