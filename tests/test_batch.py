@@ -7,7 +7,11 @@ import os
 import shutil
 import signal
 import sys
+import time
 from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -284,6 +288,47 @@ def test_an_executor_of_ones_own_is_a_callable(cli: Run, tmp_path: Path, monkeyp
     ended = cli("batch", folder, sequence(tmp_path / "t"), "--out", out, "--executor", "my_engine:make")
     assert ended.status == 2
     assert "returns no concurrent.futures.Executor" in ended.err
+
+
+def test_an_engine_that_does_not_come_back_is_said(cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, out, opened = sequence(tmp_path / "s"), tmp_path / "out", list[str]()
+
+    class Lost(Executor):
+        def submit(self, run: Any, /, *_: Any, **__: Any) -> Future[Any]:
+            ended = Future[Any]()
+            ended.cancel()
+            ended.set_running_or_notify_cancel()
+            return ended
+
+    @contextmanager
+    def engine(name: str, workers: int | None) -> Iterator[Executor]:
+        opened.append(name)
+        if len(opened) > jobs_lost:
+            raise InputError(f"`executor` {name}: no scheduler answers there; start one")
+        yield Lost()
+
+    jobs_lost = 4  # as often as an engine may lose a job, and once more
+    monkeypatch.setattr(engines, "engine", engine)
+    monkeypatch.setattr(engines, "_RETURNS_S", 0.1)
+    ended = cli("batch", folder, "--out", out)
+    assert ended.status == 3
+    assert "the engine lost it (CancelledError" in ended.err
+    jobs_lost, opened[:] = 1, []
+    ended = cli("batch", sequence(tmp_path / "t"), "--out", out)
+    assert (ended.status, ended.err.count("\n")) == (2, 3)
+    assert "waiting for it" in ended.err
+    assert "no scheduler answers there" in ended.err
+
+
+def test_clocks_of_machines_may_differ(cli: Run, tmp_path: Path) -> None:
+    """What is done is told by contents; times are those of whatever machine wrote a file."""
+    folders, out = [sequence(tmp_path / name) for name in "ab"], tmp_path / "out"
+    assert cli("batch", *folders, "--out", out).status == 0
+    before = book(out)
+    for place, path in enumerate(path for path in tmp_path.rglob("*") if path.is_file()):
+        os.utime(path, (time.time() + (-1) ** place * 86400.0,) * 2)
+    assert "2 done" in cli("batch", *folders, "--out", out).err
+    assert book(out) == before
 
 
 def test_workers_fit_into_memory_and_cores(monkeypatch: pytest.MonkeyPatch) -> None:

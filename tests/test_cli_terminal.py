@@ -219,13 +219,15 @@ def test_settings_under_which_nothing_can_be_computed_are_said(name: str, value:
     assert name in ended.stderr
 
 
-@pytest.mark.parametrize("after_s", [0.05, 0.2, 0.4, 0.8])
-def test_ctrl_c_during_imports_leaves_no_traceback(after_s: float) -> None:
+@pytest.mark.parametrize(
+    ("after_s", "number"), [*((after_s, signal.SIGINT) for after_s in (0.05, 0.2, 0.4, 0.8)), (0.4, signal.SIGTERM)]
+)
+def test_a_signal_during_imports_leaves_no_traceback(after_s: float, number: signal.Signals) -> None:
     with subprocess.Popen([*COMMAND, "info", BOX], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         time.sleep(after_s)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         _, said = process.communicate(timeout=120)
-    if process.returncode in (130, -signal.SIGINT, 0) and b"<frozen runpy>" not in said:
+    if process.returncode in (128 + number, -number, 0) and b"<frozen runpy>" not in said:
         assert said in (b"", b"modeler: interrupted\n")
     else:  # Python itself was not ready to be asked, and had not come to our code
         assert b"modeler/cli" not in said
@@ -299,8 +301,9 @@ def test_settings_for_developers_of_libraries_change_nothing(
     ]
 
 
-def test_too_few_files_are_said_in_one_line() -> None:
-    limited = 'ulimit -n 20; exec "$@"'
+@pytest.mark.parametrize("files", [8, 20])
+def test_too_few_files_are_said_in_one_line(files: int) -> None:
+    limited = f'ulimit -n {files}; exec "$@"'
     ended = subprocess.run(
         ["bash", "-c", limited, "-", *COMMAND, "info", BOX], capture_output=True, text=True, check=False
     )

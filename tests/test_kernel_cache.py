@@ -100,10 +100,10 @@ def fifo(path: Path) -> None:
 
 
 DAMAGES: dict[str, Callable[[Path], object]] = {
+    "fifo": fifo,
     "empty": lambda path: path.write_bytes(b""),
     "cut": lambda path: path.write_bytes(path.read_bytes()[:-1]),
     "flipped": flip,
-    "fifo": fifo,
     "writable by others": lambda path: path.chmod(0o666),
 }
 

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import fields, replace
 from importlib import metadata
 from pathlib import Path
@@ -88,6 +89,30 @@ def test_a_killed_run_is_taken_up(scene: Path, whole: Path, tmp_path: Path, aske
     assert sorted(asked) == sorted(pairs_of(whole) - {known})
     assert contents(folder) == contents(whole)
     assert {path.name for path in folder.iterdir()} == {path.name for path in whole.iterdir()}
+
+
+GONE: dict[str, Callable[[Path], object]] = {
+    "renamed": lambda run: run.rename(run.with_name("other")),
+    "removed": shutil.rmtree,
+    "without recording": lambda run: (run / "recording.rrd").unlink(),
+}
+
+
+@pytest.mark.parametrize("how", GONE)
+def test_what_goes_away_during_a_build_takes_no_result_with_it(
+    scene: Path, whole: Path, tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, write = tmp_path / "run", RunFolder.write
+
+    def after(self: RunFolder, step: Any, meta: RunMeta) -> dict:
+        if step.frame.index == 1:
+            GONE[how](run)
+        return write(self, step, meta)
+
+    monkeypatch.setattr(RunFolder, "write", after)
+    assert main(["build", str(scene), "--out", str(run), *QUICK]) == 0
+    assert contents(run) == contents(whole)
+    assert RunFolder(run).report()["complete"]
 
 
 def test_a_run_that_had_ended_is_not_made_again(
