@@ -95,7 +95,6 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
     taken: set[int] = set()
     failing: dict[int, _Failing] = {}
     coming: list[int] = []  # those in the folder that are not taken
-    opened: AbstractSequence | None = None  # only while it is needed: it has some names for each frame
     known, fault = False, ""  # whether `coming` is as the folder is now, and why it cannot be opened
     looks = _Looks(path, patience.settle_s)
     came_s = changed_s = time.monotonic()
@@ -104,16 +103,18 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
         if looks.changed(now):
             changed_s, known = now, False
         idle = now - max(came_s, changed_s) >= patience.idle_s
-        again = (ended or idle or index not in failing or now >= failing[index].again_s for index in coming)
-        if not known or (opened is None and any(again)):
-            opened = None  # before there is another
+        settled = ended or now - changed_s >= patience.settle_s
+        opened = None
+        if not known or any(
+            ended or idle or index not in failing or now >= failing[index].again_s
+            for index in (coming if settled else coming[:-1])
+        ):
             try:
                 opened, fault, known = open_sequence(path, overrides), "", True
                 coming = [index for index in opened.indices if index not in taken]
             except InputError as error:  # half-written, perhaps
                 fault, known, coming = str(error), False, []
         rest_s = max(POLL_S, REST * (time.monotonic() - now))
-        settled = ended or now - changed_s >= patience.settle_s
         for index in () if opened is None else coming if settled else coming[:-1]:
             assert opened is not None
             before = failing.get(index, _Failing(now, now))
@@ -140,8 +141,7 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
                     raise InputError(words)
                 _log.warning("%s: continuing with the frames so far", words.rstrip("."))
             return
-        if all(index in failing and failing[index].again_s > now + patience.settle_s for index in coming):
-            opened = None
+        opened = None  # it has some names for each frame
         time.sleep(rest_s)
 
 
