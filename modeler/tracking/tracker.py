@@ -289,19 +289,22 @@ class Tracker:
             nothing: what is returned without any view.
             unmasked: the frame, if masks are guesses.
         """
-        rough = []
+        absent, best, least, rough = nothing, None, -np.inf, []
         for view in views:
             self._check_size(view)
             distance_m = float(np.linalg.norm(view.centroid_m)) + 0.5 * self.renderer.radius_m
             poses, scores = self.search.roughly(self._viewpoints(view, distance_m), view, rng)
-            if len(poses):
-                pair = self._pair(view, poses[0], rng, most_px=COARSE_PX)
-                evidence = log_odds(pair, self.registrar.search.fine_m(pair))
+            if not len(poses):
+                continue
+            pair = self._pair(view, poses[0], rng, most_px=COARSE_PX)
+            evidence = log_odds(pair, self.registrar.search.fine_m(pair))
+            if evidence < _BEYOND_DOUBT:
                 rough.append((evidence, (poses, scores), view))
-                if evidence > _BEYOND_DOUBT:
-                    break
+                continue
+            absent = self._in_view(view, (poses, scores), rng, unmasked)
+            if absent.pose is not None:
+                return absent
         rough.sort(key=lambda one: -one[0])
-        absent, best, least = nothing, None, -np.inf
         for evidence, poses, view in rough[:_MOST_TRIED]:
             if best is not None and (evidence < least or self._holds(best, view)):
                 continue  # no rival

@@ -41,6 +41,7 @@ from studies.tracking.trials import MSSD, OURS, PARTS, Trial, built, followed, i
 T = TypeVar("T")
 _ABSENT_FRAMES = 3  # of each other capture
 _SEED = 1000  # of shapes' first scenes, apart
+_PARTS = ("captures", "table", "turned", "followed")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -52,6 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
     parser.add_argument("--shapes", type=int, default=24, metavar="N", help="rendered shapes, in all")
     parser.add_argument("--scenes", type=int, default=24, metavar="N", help="scenes of each")
+    parser.add_argument("--parts", nargs="*", choices=_PARTS, default=_PARTS, help="what is measured")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes, each with one thread")
     parser.add_argument("--seconds", type=float, default=np.inf, metavar="S", help="begin nothing after as long")
     parser.add_argument("--out", type=Path, default=Path("runs/tracking"), metavar="DIR", help="runs and results")
@@ -59,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     until_s = time.monotonic() + options.seconds
-    captures = [path for path in options.captures if _is_sequence(path)]
+    captures = [path for path in options.captures if "captures" in options.parts and _is_sequence(path)]
     for _ in _done(
         [partial(built, path, part, options.out) for path in captures for part in (*PARTS, "whole")], options.jobs
     ):
@@ -71,12 +73,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for part in PARTS
         for other in captures
     ]
-    work += [
-        partial(on_table, name, names, range(_SEED * number + some, _SEED * number + min(some + 4, options.scenes)))
-        for some in range(0, options.scenes, 4)
-        for number, name in enumerate(names)
-    ]
-    each = [one for name in names for one in (partial(turned, name, options.out), partial(followed, name))]
+    if "table" in options.parts:
+        work += [
+            partial(on_table, name, names, range(_SEED * number + some, _SEED * number + min(some + 4, options.scenes)))
+            for some in range(0, options.scenes, 4)
+            for number, name in enumerate(names)
+        ]
+    kinds = {"turned": partial(turned, out=options.out), "followed": followed}
+    each = [partial(kind, name) for name in names for part, kind in kinds.items() if part in options.parts]
     after = len(work) // 2  # those that end early have half of the table, and all else
     work[after:after] = each
     path = options.out / "trials.jsonl"
