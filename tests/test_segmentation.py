@@ -397,6 +397,14 @@ def test_masks_that_hold_some_of_the_table_are_unsure_and_lose_it_unless_it_is_m
         np.testing.assert_array_equal(one.mask, wide)  # it is kept all the same
 
 
+def test_masks_that_hold_some_of_a_wall_behind_lose_it_and_are_sure(rng):
+    world = World().box((0.0, 0.0, 0.0), (0.06, 0.05, 0.06), turn_deg=30.0, label=OBJECT)
+    frame, mask = world.box((0.0, 0.4, 0.0), (1.0, 0.01, 1.0)).frame(0, rng)
+    one = Segmenter().segment(replace(frame, mask=ndimage.binary_dilation(mask, iterations=5)), Scene())
+    assert one.outcome is Outcome.CONVERGED
+    assert iou(one.mask, mask) > 0.98
+
+
 def test_masks_that_leave_the_rim_out_are_kept(rng):
     frames, masks = turned(2, rng)
     for frame, mask in zip(frames, masks, strict=True):

@@ -32,9 +32,13 @@ class Realigner:
 
     def realigned(self, state: State) -> Generator[Searching, None, State]:
         """Return a state whose views violate each other's free space less, or the same one."""
+        tried: set[tuple[int, int]] = set()
         while (free := self._free_space(state)) is not None and not free.holds:
             gap = self._most_contradicted(state, free)
-            other = None if gap is None else (yield from self._aligned_across(state, *gap))
+            if gap is None or gap in tried:
+                break
+            tried.add(gap)
+            other = yield from self._aligned_across(state, *gap)
             found = None if other is None else self._free_space(other)
             if other is None or found is None or found.excess >= free.excess:
                 break
@@ -63,8 +67,10 @@ class Realigner:
         steps = state.steps(after, before)
         if told_otherwise(tracker.learned_prior, views[after], views[before], steps, motion[None]):
             return None
-        across = [edge for edge in state.graph.edges if (edge.source in early) != (edge.target in early)]
-        return merged.refined([rejected_elsewhere(edge, merged.solution) for edge in across]).with_spans()
+        kept = {*target.graph.edges, *source.graph.edges}
+        others = [edge for edge in state.graph.edges if edge not in kept]
+        rejected = [rejected_elsewhere(edge, merged.solution) if edge.accepted else edge for edge in others]
+        return merged.refined(rejected).with_spans()
 
     def _most_contradicted(self, state: State, free: FreeSpace) -> tuple[int, int] | None:
         """Return the two successive views across which most surface violates free space, if any does."""
