@@ -341,17 +341,17 @@ class Tracker:
             view = view if better is None else better
         likely = poses[scores > scores[0] - RIVAL_NATS][: self.registrar.max_modes]
         registered = [(self._registered(view, pose, rng), pose) for pose in likely]
-        convincing = [(posterior, pose) for posterior, pose in registered if posterior.convincing]
+        convincing = [(posterior, pose) for posterior, pose in registered if posterior.usable]
         if not convincing:
             best, _ = registered[0]
-            reason = "the images contradict the likeliest pose" if best.usable else best.outcome.label
-            return replace(absent, overlap=best.overlap, reason=reason)
+            return replace(absent, overlap=best.overlap, reason=best.outcome.label)
         pairs = [self._pair(view, se3.inverse(posterior.pose.mean) @ pose, rng) for posterior, pose in convincing]
-        # Again: the view from beside a pose, with which it was registered, shows less of what should be seen.
+        # In the pose: the view from beside it, with which it was registered, shows less of what should be seen. Where
+        # nothing was measured, as in the shadows of what hides the object, is no contradiction.
         finest = [self.registrar.search.fine_m(pair) for pair in pairs]
         evidence = [log_odds(pair, fine_m) for pair, fine_m in zip(pairs, finest, strict=True)]
         enough = [one.overlap > _OVERLAP and more > 0.0 for (one, _), more in zip(convincing, evidence, strict=True)]
-        fits = [pair.fits(np.eye(4), fine_m) for pair, fine_m in zip(pairs, finest, strict=True)]
+        fits = [pair.without_holes().fits(np.eye(4), fine_m) for pair, fine_m in zip(pairs, finest, strict=True)]
         kept = [k for k in range(len(pairs)) if enough[k] and fits[k]]
         if not kept:
             reason = "the images contradict all poses" if any(enough) else "too little surface matches"
