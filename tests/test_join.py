@@ -107,6 +107,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, di
     parts = folder / "upright_run", folder / "lying_run"
     report = json.loads((parts[0] / "report.json").read_bytes())
     report["frames"][1]["note"] = "what other programs add is nobody's business"
+    report["settings"]["tolerance_mm"] = 12.0
     (parts[0] / "report.json").write_text(json.dumps(report))
     status = main(["join", *map(str, parts), "--out", str(folder / "joined"), "--pairs", "4"])
     assert status == 0
@@ -117,6 +118,7 @@ def test_frames_of_both_runs_find_their_places(runs: tuple[Path, Path, Path, dic
     report = RunFolder(runs[2]).report()
     assert [frame["id"] for frame in report["frames"]] == list(range(2 * COUNT))
     assert report["settings"]["joined"] == [f"../{run.name}" for run in runs[:2]]
+    assert report["tolerance_m"] == 0.012  # as stated for one of the runs
     poses = {pose["id"]: np.reshape(pose["object_from_camera"], (4, 4)) for pose in report["poses"]}
     base = poses[0] @ se3.inverse(runs[3][0])
     for k, pose in poses.items():
@@ -303,6 +305,7 @@ def test_frames_of_another_recording_find_their_places_on_a_model(grown: tuple[P
     report = RunFolder(grown[0]).report()
     new = [COUNT + k for k in range(0, COUNT, 3)]
     assert [frame["id"] for frame in report["frames"]] == [*range(COUNT), *new]
+    assert report["settings"]["tolerance_mm"] == 12.0
     assert (np.diff([frame["timestamp"] for frame in report["frames"]]) > 0.0).all()
     poses = {pose["id"]: np.reshape(pose["object_from_camera"], (4, 4)) for pose in report["poses"]}
     assert [*poses] == [*range(COUNT), *new]

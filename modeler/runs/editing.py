@@ -73,8 +73,7 @@ def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> 
     sequence = " + ".join(sequences_of(run, before, out))
     meta = RunMeta(sequence, report["seed"], report["prior"], settings, report.get("camera"))
     same, work = out.resolve() == run.resolve(), Work((part,), graph, solution, edges, began_s)
-    expected = _expected(before, settings.get("tolerance_mm"))
-    found, verdict = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **expected)
+    found, verdict = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **_expected(before))
     return Edited(found, verdict, unconnected)
 
 
@@ -84,8 +83,8 @@ def _without(run: Reopened, frames: Collection[int]) -> Reopened:
     return replace(run, report=report, views={k: view for k, view in run.views.items() if k not in frames})
 
 
-def _expected(run: Reopened, tolerance_mm: float | None) -> dict[str, Any]:
-    """Return what the verdict on a run depends on besides its last step and its camera."""
+def _expected(run: Reopened) -> dict[str, Any]:
+    """Return what the verdict on a run depends on besides its last step, its camera and the stated tolerance."""
     part, *others = run.parts
     if others:
         return {}
@@ -93,6 +92,5 @@ def _expected(run: Reopened, tolerance_mm: float | None) -> dict[str, Any]:
     return {
         "prior": parts.prior,
         "closure_expected": comes_back(part.sequence, parts.prior, parts.closer.max_angle_deg),
-        "tolerance_m": None if tolerance_mm is None else 1e-3 * tolerance_mm,
         "colour": parts.colour,
     }

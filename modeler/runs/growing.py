@@ -17,7 +17,7 @@ from modeler.graph import PoseGraph, solve
 from modeler.pipeline.joining import Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
-from modeler.runs.joining import Work, groups_of, later_s, sequences_of, write_run
+from modeler.runs.joining import Work, groups_of, later_s, sequences_of, stated_tolerance, write_run
 from modeler.runs.known_objects import known_object
 from modeler.runs.reopening import Part, Reopened, reopened
 from modeler.sequences import AbstractSequence, Overrides
@@ -84,6 +84,7 @@ class Growth:
         offset = max(record["id"] for record in before.report["frames"]) + 1
         settings = {name: value for name, value in vars(self.where).items() if value is not None}
         settings |= {name: value for name, value in vars(self.given).items() if value not in (None, ())}
+        settings |= stated_tolerance(before)
         report = {"settings": settings, "frames": (), "camera": _camera(before, frames)}
         part = Part(out, report, frames, offset)
         times_s = [{"timestamp": frames.frame(k).time_s} for k in (frames.indices[0], frames.indices[-1])]

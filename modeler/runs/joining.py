@@ -79,6 +79,7 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
             "offset": offset,
             "later_s": delay_s,
             "pairs": pairs,
+            **stated_tolerance(first, second),
         },
         camera=_least_known([*first.parts, *second.parts]),
     )
@@ -91,6 +92,13 @@ def sequences_of(run: Path, opened: Reopened, out: Path) -> list[str]:
     """Return the sequences of a run as the report of another one has them."""
     parts = opened.report["sequence"].split(" + ")
     return [RunFolder(out).stored(RunFolder(run).located(part)) for part in parts]
+
+
+def stated_tolerance(*runs: Reopened) -> dict[str, float]:
+    """Return the settings for the least tolerance stated for one of some runs; none if there is none."""
+    stated = [run.report["settings"].get("tolerance_mm") for run in runs]
+    known = [tolerance_mm for tolerance_mm in stated if tolerance_mm is not None]
+    return {"tolerance_mm": min(known)} if known else {}
 
 
 def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
@@ -173,13 +181,15 @@ def write_run(
         meta: contents of the report besides the results.
         overwrite: replace another run there.
         resume: replace the files of the run there one by one.
-        expected: arguments of `judged` besides the step and the uncertainty of the depth scale.
+        expected: arguments of `judged` besides the step, the uncertainty of the depth scale and the tolerance.
     """
     with locked(out):
         folder = RunFolder.open(out, overwrite=overwrite, resume=resume)
         step = _last_step(work, meta.settings.get("voxel_m"))
         sigma = 0.0 if meta.camera is None else float(meta.camera["depth_scale_sigma"])
-        verdict = judged(step, depth_scale_sigma=sigma, **expected)
+        tolerance_mm = meta.settings.get("tolerance_mm")
+        tolerance_m = None if tolerance_mm is None else 1e-3 * tolerance_mm
+        verdict = judged(step, depth_scale_sigma=sigma, tolerance_m=tolerance_m, **expected)
         step = replace(step, verdict=verdict)
         facts = {"sequence": meta.sequence, "seed": meta.seed, **meta.settings}
         name = " + ".join(part.name for part in work.parts)
