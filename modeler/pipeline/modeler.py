@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeVar, final
+from typing import final
 
 from modeler.closure import Closer, Placement
 from modeler.fusion import Fuser, Preview, conditional_covariances, widened
 from modeler.graph import MovingGraph, estimate_focal_length, shared_noise, variance_factor
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.joining import Joiner
+from modeler.pipeline.newest import with_last
 from modeler.pipeline.pairs import Prepared, Registrations, prepare, without_limits
 from modeler.pipeline.realigning import Realigner, joined
-from modeler.pipeline.state import State
+from modeler.pipeline.state import Placed, State
 from modeler.pipeline.tracking import Tracker
 from modeler.priors import GeneralPrior
 from modeler.registration import VisibilityRegistrar
@@ -46,8 +47,6 @@ from modeler.views import Sensor
 
 _FOCAL_REACH = 5.0  # prior standard deviations: nominal focal lengths of captures are off by up to 4.5
 _MIN_SEGMENT = 3  # frames that fit each other: two may do so by chance
-
-T = TypeVar("T")
 
 
 @final
@@ -204,21 +203,6 @@ class Modeler:
 
 
 @final
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A processed frame."""
-
-    state: State
-    """The state of the run after it."""
-    prepared: Prepared
-    """The frame, with the reason if it is left out."""
-    posteriors: tuple[Posterior, ...]
-    """Its registrations."""
-    edges: tuple[Edge, ...]
-    """These as edges, accepted or rejected."""
-
-
-@final
 @dataclass(eq=False)
 class Run:
     """One run and the only owner of its state: six phases in order, each a stream of events.
@@ -257,7 +241,7 @@ class Run:
         """
         with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
             coming = map(preparing, frames)
-            for prepared, last in ((one, False) for one in coming) if live else _with_last(coming):
+            for prepared, last in ((one, False) for one in coming) if live else with_last(coming):
                 found = prepared()
                 self.state = self.state.read(found)
                 placed = yield from self._placed(self.state, found, self.state.latest, last=last)
@@ -273,7 +257,7 @@ class Run:
             InputError: if two frames have the same number.
         """
         with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
-            for preparation, _ in _with_last(map(preparing, frames)):  # reads one ahead, which is prepared meanwhile
+            for preparation, _ in with_last(map(preparing, frames)):  # reads one ahead, which is prepared meanwhile
                 prepared = preparation()
                 self.state = self.state.inserted(prepared)
                 nearest = self.state.map_view.nearest_in_time(prepared.frame.index)
@@ -299,8 +283,6 @@ class Run:
         If the object was laid down differently or regrasped, the motion prior does not hold between the frames before
         and after, and all frames after are lost; among these it holds.
         """
-        realigner = Realigner(self.modeler.tracker, self.modeler.joiner, self.modeler.tolerance_m)
-        self.state = yield from realigner.realigned(self.state)
         tried: set[int] = set()
         if any(len(frames) >= _MIN_SEGMENT for frames in self.state.lost_intervals()):  # loops first, within segments
             yield from self.refine()
@@ -322,8 +304,10 @@ class Run:
             self.state = state
             yield event
 
-    def finish(self, *, interrupted: bool = False) -> Iterator[Step | Fusing]:
+    def finish(self, *, interrupted: bool = False) -> Iterator[Step | Searching | Refining | Fusing]:
         """Solve the graph with the noise that its edges share, fuse and judge the model, and yield the last step.
+
+        If the images contradict the poses across some pair, both parts are aligned anew first, unless interrupted.
 
         Args:
             interrupted: whether the user ended the run before its last frame.
@@ -331,7 +315,10 @@ class Run:
         newest, model = self.state.newest, None
         if newest is None:
             return
+        before = self.state
         self._solve()
+        if not interrupted:
+            yield from self._realigned(before)
         if self.state.views:
             yield Fusing()
             conditional = conditional_covariances(self.state.solution, self.state.graph.edges)
@@ -378,6 +365,26 @@ class Run:
             part = refined
             yield event
         return part.with_spans()
+
+    def _realigned(self, before: State) -> Iterator[Searching | Refining]:
+        """Align parts of the run anew across a pair that the images contradict, if that makes them contradict less.
+
+        Args:
+            before: the state before the graph was solved with what its edges share.
+        """
+        realigner, solved = Realigner(self.modeler.tracker, self.modeler.joiner, self.modeler.tolerance_m), self.state
+        found = realigner.free_space(solved)
+        if found is None or found.holds:
+            return
+        realigned = yield from realigner.realigned(before)
+        if realigned is before:
+            return
+        self.state = realigned
+        yield from self.refine()
+        self._solve()
+        again = realigner.free_space(self.state)
+        if again is None or again.excess >= found.excess:
+            self.state = solved
 
     def _joined(self, segment: State) -> Iterator[Step]:
         """Join a segment with the views so far, if possible; yield steps of its frames."""
@@ -485,13 +492,3 @@ class Run:
         )
         self.records[step.frame.index] = step.record
         return replace(step, frames_so_far=tuple(self.records[frame] for frame in sorted(self.records)))
-
-
-def _with_last(items: Iterable[T]) -> Iterator[tuple[T, bool]]:
-    """Yield items with whether they are the last, by reading one ahead."""
-    remaining = iter(items)
-    for item in remaining:
-        for following in remaining:
-            yield item, False
-            item = following
-        yield item, True

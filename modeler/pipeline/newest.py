@@ -6,10 +6,12 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import final
+from typing import TypeVar, final
 
 from modeler.system.disk_arrays import ViewStore
 from modeler.types import Frame
+
+T = TypeVar("T")
 
 
 @final
@@ -85,3 +87,13 @@ class NewestFrames:
             stopped = True
         if errors:
             raise errors[0]
+
+
+def with_last(items: Iterable[T]) -> Iterator[tuple[T, bool]]:
+    """Yield items with whether they are the last, by reading one ahead."""
+    remaining = iter(items)
+    for item in remaining:
+        for following in remaining:
+            yield item, False
+            item = following
+        yield item, True

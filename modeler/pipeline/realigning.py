@@ -33,17 +33,23 @@ class Realigner:
     def realigned(self, state: State) -> Generator[Searching, None, State]:
         """Return a state whose views violate each other's free space less, or the same one."""
         tried: set[tuple[int, int]] = set()
-        while (free := self._free_space(state)) is not None and not free.holds:
+        while (free := self.free_space(state)) is not None and not free.holds:
             gap = self._most_contradicted(state, free)
             if gap is None or gap in tried:
                 break
             tried.add(gap)
             other = yield from self._aligned_across(state, *gap)
-            found = None if other is None else self._free_space(other)
+            found = None if other is None else self.free_space(other)
             if other is None or found is None or found.excess >= free.excess:
                 break
             state = other
         return state
+
+    def free_space(self, state: State, among: Iterable[int] | None = None) -> FreeSpace | None:
+        """Return the free-space violations between views of a state, by default all, as the verdict judges them."""
+        tolerance_m = self.tolerance_m or default_tolerance_m([*state.views.values()])
+        views = {frame: state.views[frame] for frame in (state.views if among is None else among)}
+        return free_space(views, state.solution.trajectory, tolerance_m)
 
     def _aligned_across(self, state: State, before: int, after: int) -> Generator[Searching, None, State | None]:
         """Return a state with another alignment of the frames from one on with those before; None without one.
@@ -79,15 +85,9 @@ class Realigner:
             between = [view for view in state.views if places[gap[0]] <= places[view] <= places[gap[1]]]
             if len(between) == 2:
                 return gap
-            found = self._free_space(state, between)
+            found = self.free_space(state, between)
             gap = None if found is None else found.most_contradicted(places)
         return None
-
-    def _free_space(self, state: State, among: Iterable[int] | None = None) -> FreeSpace | None:
-        """Return the free-space violations between views of a state, by default all, as the verdict judges them."""
-        tolerance_m = self.tolerance_m or default_tolerance_m([*state.views.values()])
-        views = {frame: state.views[frame] for frame in (state.views if among is None else among)}
-        return free_space(views, state.solution.trajectory, tolerance_m)
 
 
 def joined(joiner: Joiner, target: State, source: State) -> tuple[State | None, Sequence[Edge]]:

@@ -325,6 +325,20 @@ class State:
         return replace(prepared, frame=frame, segmentation=found, view=view)
 
 
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A processed frame."""
+
+    state: State
+    """The state of the run after it."""
+    prepared: Prepared
+    """The frame, with the reason if it is left out."""
+    posteriors: tuple[Posterior, ...]
+    """Its registrations."""
+    edges: tuple[Edge, ...]
+    """These as edges, accepted or rejected."""
+
+
 def newest_ready(views: Mapping[int, RayImage]) -> dict[int, RayImage]:
     """Return the newest views, whose images for registration stay in memory; others are recomputed on demand."""
     kept, size = [], 0
