@@ -100,7 +100,12 @@ GONE: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("how", GONE)
 def test_what_goes_away_during_a_build_takes_no_result_with_it(
-    scene: Path, whole: Path, tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch
+    scene: Path,
+    whole: Path,
+    tmp_path: Path,
+    how: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     run, write = tmp_path / "run", RunFolder.write
 
@@ -113,6 +118,8 @@ def test_what_goes_away_during_a_build_takes_no_result_with_it(
     assert main(["build", str(scene), "--out", str(run), *QUICK]) == 0
     assert contents(run) == contents(whole)
     assert RunFolder(run).report()["complete"]
+    assert {path.name for path in run.iterdir()} == {path.name for path in whole.iterdir()}
+    assert f"{run / 'recording.rrd'}: was moved or removed" in caplog.text
 
 
 def test_a_run_that_had_ended_is_not_made_again(

@@ -226,14 +226,20 @@ def test_a_disk_that_hangs_does_not_hold_the_run(
     released.set()
 
 
-def test_a_recording_that_is_deleted_meanwhile_does_not_stop_the_run(
-    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_recording_that_is_moved_meanwhile_is_written_again_unless_something_else_is_there(
+    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture, replaced: bool
 ) -> None:
-    stream = open_stream("box", save=tmp_path / "r.rrd")
-    (tmp_path / "r.rrd").unlink()
+    path, moved = tmp_path / "r.rrd", tmp_path / "moved"
+    stream = open_stream("box", save=path)
+    path.rename(moved)
+    if replaced:
+        path.write_bytes(b"other")
     stream(run[0])
     stream.close()
-    assert caplog.text == ""
+    assert path.read_bytes() == (b"other" if replaced else moved.read_bytes())
+    assert f"{path}: was moved or removed" in caplog.text
+    assert ("File exists" in caplog.text) == replaced
 
 
 def test_a_disk_that_fills_before_the_recording_begins_is_said(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import queue
 import sys
 import threading
 from collections.abc import Callable
+from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
@@ -30,7 +31,8 @@ _BEGINNING: Final = 4096  # bytes that must fit on the disk to begin with
 class RecordingFile:
     """A file that Rerun writes through a pipe: Rerun 0.41 waits for ever at the end of a file that it could not write.
 
-    What the disk does not take is dropped; the file then ends there.
+    What the disk does not take is dropped; the file then ends there. If it is moved or removed meanwhile, it is written
+    once more in its place, unless something else is there.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,6 +40,8 @@ class RecordingFile:
         self.path = path
         self.error: OSError | None = None
         """Why the file is cut off, if it is."""
+        self.went_away = False
+        """Whether it was moved or removed meanwhile."""
         try:
             create_regular(path)
             path.write_bytes(bytes(_BEGINNING))
@@ -68,21 +72,43 @@ class RecordingFile:
             self.error = self.error or TimeoutError("the disk does not answer")
             let_go()
         if self.error is not None:
+            what = "was moved or removed, and cannot be written again" if self.went_away else "is truncated"
             why = self.error.strerror or self.error
-            _log.warning("%s: is truncated (%s); the other files do not depend on it", self.path, why)
+            _log.warning("%s: %s (%s); the other files do not depend on it", self.path, what, why)
+        elif self.went_away:
+            _log.warning("%s: was moved or removed during the run; it is written again", self.path)
 
     def _copy(self) -> None:
         """Copy to the file what Rerun writes."""
         with open(self._source, "rb", buffering=0) as source, self._file as file:
-            while piece := source.read(PIECE_BYTES):
-                while piece and self.error is None:
-                    try:
-                        written = file.write(piece)
-                    except OSError as error:
-                        self.error = error
-                    else:
-                        self._written += written
-                        piece = piece[written:]
+            self._fill(file, source)
+            try:
+                if self.error is None and not self._in_place(file):
+                    self.went_away = True
+                    file.seek(0)
+                    with self.path.open("xb", buffering=0) as again:
+                        self._fill(again, file)
+            except OSError as error:
+                self.error = error
+
+    def _fill(self, file: FileIO, source: FileIO) -> None:
+        """Write to a file all that can be read, until the disk takes no more."""
+        while piece := source.read(PIECE_BYTES):
+            while piece and self.error is None:
+                try:
+                    written = file.write(piece)
+                except OSError as error:
+                    self.error = error
+                else:
+                    self._written += written
+                    piece = piece[written:]
+
+    def _in_place(self, file: FileIO) -> bool:
+        """Return whether a file still has its name."""
+        try:
+            return os.path.samestat(os.stat(self.path), os.fstat(file.fileno()))
+        except FileNotFoundError:
+            return False
 
 
 @final
