@@ -126,6 +126,7 @@ class Modeler:
         yield from run.revisit()
         yield from run.rejoin()
         yield from run.refine()
+        yield from run.realign()
         yield from run.finish()
 
     @checked
@@ -205,10 +206,10 @@ class Modeler:
 @final
 @dataclass(eq=False)
 class Run:
-    """One run and the only owner of its state: six phases in order, each a stream of events.
+    """One run and the only owner of its state: seven phases in order, each a stream of events.
 
-    `fill` is for frames that were skipped. To save time, `revisit`, `rejoin` and `refine` may be omitted or stopped at
-    any event; `finish` uses what is there.
+    `fill` is for frames that were skipped. To save time, `revisit`, `rejoin`, `refine` and `realign` may be omitted or
+    stopped at any event; `finish` uses what is there.
     """
 
     modeler: Modeler
@@ -227,6 +228,7 @@ class Run:
     def __post_init__(self) -> None:
         """Start with an empty preview."""
         self._preview = Preview(self.modeler.fuser)
+        self._solved: State | None = None
 
     def track(self, frames: Iterable[Frame], *, live: bool = False) -> Iterator[Step | Searching]:
         """Register each frame against earlier views. A frame that cannot be placed is reported and left out.
@@ -304,10 +306,28 @@ class Run:
             self.state = state
             yield event
 
-    def finish(self, *, interrupted: bool = False) -> Iterator[Step | Searching | Refining | Fusing]:
-        """Solve the graph with the noise that its edges share, fuse and judge the model, and yield the last step.
+    def realign(self) -> Iterator[Searching | Refining]:
+        """Align parts of the run anew across a pair that the images contradict, if that makes them contradict less."""
+        before = self.state
+        if before.newest is None:
+            return
+        self._solve()
+        realigner = Realigner(self.modeler.tracker, self.modeler.joiner, self.modeler.tolerance_m)
+        found = realigner.free_space(self.state)
+        if found is None or found.holds:
+            return
+        realigned = yield from realigner.realigned(before)
+        if realigned is before:
+            return
+        other = replace(self, state=realigned)
+        yield from other.refine()
+        other._solve()
+        again = realigner.free_space(other.state)
+        if again is not None and again.excess < found.excess:
+            self.state = self._solved = other.state
 
-        If the images contradict the poses across some pair, both parts are aligned anew first, unless interrupted.
+    def finish(self, *, interrupted: bool = False) -> Iterator[Step | Fusing]:
+        """Solve the graph with the noise that its edges share, fuse and judge the model, and yield the last step.
 
         Args:
             interrupted: whether the user ended the run before its last frame.
@@ -315,10 +335,7 @@ class Run:
         newest, model = self.state.newest, None
         if newest is None:
             return
-        before = self.state
         self._solve()
-        if not interrupted:
-            yield from self._realigned(before)
         if self.state.views:
             yield Fusing()
             conditional = conditional_covariances(self.state.solution, self.state.graph.edges)
@@ -365,26 +382,6 @@ class Run:
             part = refined
             yield event
         return part.with_spans()
-
-    def _realigned(self, before: State) -> Iterator[Searching | Refining]:
-        """Align parts of the run anew across a pair that the images contradict, if that makes them contradict less.
-
-        Args:
-            before: the state before the graph was solved with what its edges share.
-        """
-        realigner, solved = Realigner(self.modeler.tracker, self.modeler.joiner, self.modeler.tolerance_m), self.state
-        found = realigner.free_space(solved)
-        if found is None or found.holds:
-            return
-        realigned = yield from realigner.realigned(before)
-        if realigned is before:
-            return
-        self.state = realigned
-        yield from self.refine()
-        self._solve()
-        again = realigner.free_space(self.state)
-        if again is None or again.excess >= found.excess:
-            self.state = solved
 
     def _joined(self, segment: State) -> Iterator[Step]:
         """Join a segment with the views so far, if possible; yield steps of its frames."""
@@ -441,17 +438,19 @@ class Run:
         informs it once. Noise is shared by the edges of a frame and by all views. If loops determine the focal length,
         views and edges are converted to its estimate.
         """
+        if self.state is self._solved:
+            return
         state, focal = self.state.with_spans(), None
         if (sigma := self.modeler.sensor.noise.sigma_focal) > 0.0 and len(state.solution.trajectory) > 1:
             state, focal = self._with_focal_length(state, sigma)
         distance_sigma = self.modeler.common_distance if sigma > 0.0 else 0.0
         solved = partial(state.solved, focal=focal, distance_sigma=distance_sigma)
         if (about_axis := solved().about_axis(self.modeler.prior)) is not None:
-            self.state = about_axis
+            self.state = self._solved = about_axis
             return
         factor = variance_factor(state.graph, state.solution, state.exact_share)
         shared = shared_noise(state.graph, state.solution, factor)
-        self.state = solved(shared=shared, common=self.modeler.common_noise, variance_factor=factor)
+        self.state = self._solved = solved(shared=shared, common=self.modeler.common_noise, variance_factor=factor)
 
     def _with_focal_length(self, state: State, sigma: float) -> tuple[State, FocalLength]:
         """Return a state under the focal length estimated from its loops, and the estimate.

@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +94,7 @@ def demonstrate(recipe: Recipe, folder: RunFolder, stream: RerunStream, goal: Go
     sequence = robot.stage.sequence
     facts = {"name": recipe.name, "sensor": sequence.sensor()._asdict(), "source": "rendered"}
     write_bop(Path(meta.sequence), sequence, sequence.truth(), facts, depth_scale_mm=recipe.depth_unit_mm)
-    for _ in run.refine():
+    for _ in chain(run.refine(), run.realign()):
         pass
     last = [event for event in run.finish() if isinstance(event, Step)][-1]
     stream(last)

@@ -84,7 +84,8 @@ def followed(shape: str) -> int:
                     if first_model_s == np.inf and event.model is not None:
                         first_model_s = time.monotonic() - began_s
             tracked_s = time.monotonic() - began_s
-            for event in chain(run.fill(newest.skipped), run.revisit(), run.rejoin(), run.refine(), run.finish()):
+            phases = (run.fill(newest.skipped), run.revisit(), run.rejoin(), run.refine(), run.realign(), run.finish())
+            for event in chain.from_iterable(phases):
                 if isinstance(event, Step):
                     folder.write(event, meta)
                     draw(event)
