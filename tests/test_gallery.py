@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -108,6 +110,29 @@ def test_a_model_that_was_removed_leaves_its_row(cli: Run, tmp_path: Path) -> No
     (tmp_path / NOTES / "gone.json").write_text(json.dumps(note(1)))
     assert cli("gallery", tmp_path).status == 0
     assert '"link":null' in (tmp_path / "gallery.html").read_text()
+
+
+def test_runs_that_others_have_closed_are_named_and_left_out(cli: Run) -> None:
+    user = os.geteuid()
+    with tempfile.TemporaryDirectory() as place:  # pytest's own folders are closed to others
+        os.chmod(place, 0o777)
+        for folder, mode in ((NOTES, 0o777), ("other", 0)):
+            (Path(place) / folder).mkdir()
+            (Path(place) / folder).chmod(mode)
+        (Path(place) / NOTES / "own.json").write_text(json.dumps(note(1)))
+        assert [cli(command, place).status for command in ("gallery", "view")] == [0, 2]  # loads what is root's alone
+        try:
+            if user == 0:
+                os.seteuid(65534)
+            done = cli("gallery", place, "--out", Path(place) / "other.html")
+            alone = cli("view", Path(place) / "other")
+        finally:
+            os.seteuid(user)
+            (Path(place) / "other").chmod(0o700)
+    assert done.status == 0
+    assert re.findall(r"modeler: (.*): cannot be read \(Permission denied\)", done.err) == ["other"]
+    assert alone.status == 2
+    assert "Permission denied" in alone.err
 
 
 @browser

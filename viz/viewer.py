@@ -125,8 +125,12 @@ def view(run: Path, *, web: bool = False) -> Viewer:
         InputError: if the folder has no recording, or the viewer does not start.
     """
     recording = run / "recording.rrd"
-    if not os.path.lexists(recording):
-        raise InputError(f"{run}: no recording.rrd here; give a run folder of `modeler build`")
+    try:
+        os.lstat(recording)
+    except PermissionError:
+        pass  # it may be there, and the look at it says why it cannot be read
+    except (OSError, ValueError):
+        raise InputError(f"{run}: no recording.rrd here; give a run folder of `modeler build`") from None
     check_regular(recording)
     return start_web(recording) if web else start_window([recording])
 

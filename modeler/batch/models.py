@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,21 @@ def models_in(out: Path) -> list[dict[str, Any]]:
         row["failure"] = note.get("line") if record is None else None
         rows.append(row | {"sequence": note.get("sequence") or row.get("sequence")})
     return rows
+
+
+def closed_in(out: Path) -> list[str]:
+    """Return the names of what lies in a folder and may not be looked into: the runs of other users, perhaps."""
+
+    def closed(path: Path) -> bool:
+        try:
+            os.lstat(path / "report.json")
+        except PermissionError:
+            return True
+        except OSError:
+            return False
+        return False
+
+    return sorted(path.name for path in out.glob("*") if closed(path))
 
 
 def _of_build(run: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:

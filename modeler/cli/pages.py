@@ -111,7 +111,7 @@ class Gallery:
         from urllib.parse import quote
 
         from modeler.batch.jobs import NOTES
-        from modeler.batch.models import TABLE, models_in, thumbnail_of
+        from modeler.batch.models import TABLE, closed_in, models_in, thumbnail_of
         from modeler.export.models_table import blank, write_table
         from modeler.runs.outputs import check_files
         from modeler.system.regular_files import read_regular
@@ -121,6 +121,8 @@ class Gallery:
         out = self.folder / "gallery.html" if self.out is None else self.out
         check_files([out], [], overwrite=self.overwrite)
         rows = models_in(self.folder)
+        if closed := closed_in(self.folder):
+            say(f"{', '.join(closed)}: cannot be read (Permission denied), and left out; ask their owner")
         if not rows:
             raise InputError(f"{self.folder}: holds no run folder; give the --out of modeler batch")
         write_table(self.folder / TABLE, rows)
