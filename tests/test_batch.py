@@ -331,6 +331,20 @@ def test_clocks_of_machines_may_differ(cli: Run, tmp_path: Path) -> None:
     assert book(out) == before
 
 
+def test_a_disk_that_shows_late_what_others_wrote_is_waited_for(
+    cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks, read = list[Path](), engines.read_note
+
+    def late(path: Path) -> dict[str, Any]:
+        looks.append(path)
+        return {} if len(looks) < 3 else read(path)
+
+    monkeypatch.setattr(engines, "read_note", late)
+    assert cli("batch", sequence(tmp_path / "s"), "--out", tmp_path / "out").status == 0
+    assert looks == [tmp_path / "out" / NOTES / "s.json"] * 3
+
+
 def test_workers_fit_into_memory_and_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0 < engines.free_bytes() < 1 << 50
     monkeypatch.setattr(engines, "cores", lambda: 8)
