@@ -195,6 +195,24 @@ def test_an_argument_of_another_type_is_refused_by_name(what: Callable[..., Any]
                 what(**{name: wrong})
 
 
+@pytest.mark.parametrize(
+    ("what", "wrong"),
+    [
+        (modeler.TurntablePrior, {"step_deg": 5.0, "step_sign": np.ones(2)}),
+        (modeler.known_object, {"path": "x", "unit": np.ones(2)}),
+    ],
+)
+def test_an_array_in_place_of_a_word_is_refused(what: Callable[..., Any], wrong: dict[str, Any]) -> None:
+    with pytest.raises(modeler.InputError, match=f"`{[*wrong][-1]}` is of type ndarray"):
+        what(**wrong)
+
+
+@pytest.mark.parametrize("roi", [(), (0, 0, 9), (5, 0, 5, 9), np.zeros((0, 0), int)])
+def test_a_region_without_four_edges_or_pixels_is_refused(roi: Any) -> None:
+    with pytest.raises(modeler.InputError, match="is empty; give X0 Y0 X1 Y1"):
+        modeler.Segmenter(roi=roi)
+
+
 def test_a_used_folder_is_refused_before_a_frame_is_taken(tmp_path: Path) -> None:
     (tmp_path / "note.txt").touch()
     with pytest.raises(modeler.InputError, match="not empty"):

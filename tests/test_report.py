@@ -13,6 +13,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from PIL import Image
 from scipy import ndimage
@@ -27,7 +28,7 @@ from modeler.fusion import Symmetries
 from modeler.fusion.symmetries import Axis
 from modeler.types import Array
 from modeler.viz import entities, reader
-from modeler.viz.report import run_data, write_page
+from modeler.viz.report import cards, run_data, write_page
 from modeler.viz.report.mesh import read_mesh, scene
 from modeler.viz.report.page import CHECKS, rotation_words
 from modeler.viz.report.run_data import Result, recorded, surfaces
@@ -349,6 +350,17 @@ def test_a_recording_that_ends_its_reader_is_as_good_as_none(
 
 
 @pytest.mark.usefixtures("_undrawn")
+def test_damaged_points_of_a_recording_are_drawn_nowhere() -> None:
+    points = [[0.0, 0.0, 0.0], [0.1, 0.1, 0.1], [1e30, 0.0, 0.0], [np.inf, -np.inf, 0.0], [np.nan] * 3]
+    row = {"positions": pa.scalar(points), "colors": pa.scalar([255])}
+    found = run_data.cloud(row)
+    assert found is not None
+    np.testing.assert_array_equal(found[0][:, 0], [0.0, 0.1, 1e30])
+    sound = found[0][:2], found[1][:2]
+    assert cards._pair_picture(sound, found) == cards._pair_picture(sound, sound)
+    assert run_data.cloud(row | {"positions": pa.scalar(points[3:])}) is None
+
+
 def test_without_truth_recording_or_mesh_the_page_says_so(run: Path, tmp_path: Path) -> None:
     (tmp_path / "report.json").write_bytes((run / "report.json").read_bytes())
     write_page(tmp_path, tmp_path / "page.html")

@@ -61,10 +61,9 @@ class Segmenter:
 
     def __post_init__(self) -> None:
         """Check the parameters."""
-        if self.roi is not None and not (0 <= self.roi[0] < self.roi[2] and 0 <= self.roi[1] < self.roi[3]):
-            raise InputError(
-                f"`roi` {' '.join(map(str, self.roi))} is empty; give X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1."
-            )
+        roi = self.roi
+        if roi is not None and not (len(roi) == 4 and 0 <= roi[0] < roi[2] and 0 <= roi[1] < roi[3]):
+            raise InputError(f"`roi` {' '.join(map(str, roi))} is empty; give X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1.")
         if self.max_depth_m is not None and not self.max_depth_m > 0.0:
             raise InputError(f"`max_depth_m` {self.max_depth_m:g} is out of range; give a positive depth in m.")
 

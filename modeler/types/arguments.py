@@ -57,7 +57,7 @@ def _fits(value: object, hint: Any) -> bool:
     if kind in (Union, types.UnionType):
         return (value is not None and frozenset(of) >= _ARRAYS) or any(_fits(value, one) for one in of)
     if kind is Literal:
-        return value in of
+        return any(isinstance(value, type(one)) and value == one for one in of)
     if kind in (tuple, Sequence):  # an array serves as well
         if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str | bytes):
             return False

@@ -366,9 +366,10 @@ def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
     places = np.rint(seen[:, :2] * (0.40 * height / max(reach_m, 1e-9)) + 0.5 * np.array([width, height]))
     order = np.repeat(np.argsort(-seen[:, 2], kind="stable"), len(_DOT))
     picture = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
-    columns, rows = (places[order] + np.tile(_DOT, (len(points), 1))).astype(np.int64).T
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    picture[rows[inside], columns[inside]] = colours[order][inside]
+    dots = places[order] + np.tile(_DOT, (len(points), 1))
+    inside = ((dots >= 0) & (dots < (width, height))).all(axis=1)
+    columns, rows = dots[inside].astype(np.int64).T
+    picture[rows, columns] = colours[order][inside]
     return _jpeg(picture)
 
 

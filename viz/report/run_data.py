@@ -111,13 +111,14 @@ def registered(caption: Row) -> tuple[int, int] | None:
 
 
 def cloud(row: Row) -> tuple[Array, npt.NDArray[np.uint8]] | None:
-    """Return points (n, 3) in m and colours (n, 3) of a row; None if it has none."""
+    """Return points (n, 3) in m and colours (n, 3) of a row, without what damage made infinite; None if it has none."""
     if "positions" not in row or "colors" not in row:
         return None
     points = np.array(row["positions"].as_py(), dtype=np.float64).reshape(-1, 3)
     packed = np.array(row["colors"].as_py(), dtype=np.uint32)
     colours = np.stack([packed >> 24, packed >> 16, packed >> 8], axis=1).astype(np.uint8)
-    return points, np.broadcast_to(colours, points.shape)
+    known = np.isfinite(points).all(axis=1)
+    return (points[known], np.broadcast_to(colours, points.shape)[known]) if known.any() else None
 
 
 def surfaces(rows: Mapping[str, Mapping[int, Row]]) -> dict[int, Array]:
