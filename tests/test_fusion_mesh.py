@@ -118,6 +118,7 @@ def test_one_view_whose_pose_is_off_does_not_hollow_a_watertight_model(off):
 RADIUS_M, NOISE_M = 0.05, 0.0004
 ICOSPHERE = trimesh.creation.icosphere(5, RADIUS_M)
 TRIANGLES = np.asarray(ICOSPHERE.faces, dtype=np.int64)
+MEANS = meshing.neighbour_means(TRIANGLES, len(ICOSPHERE.vertices))
 EDGE_M = float(np.mean(ICOSPHERE.edges_unique_length))
 
 
@@ -134,14 +135,14 @@ def test_only_vertices_asked_for_are_smoothed_and_nothing_shrinks(rng: np.random
     vertices_m = rough(rng)
     before_m = vertices_m.copy()
     only = vertices_m[:, 2] > 0.0
-    smooth_m = meshing.taubin_smoothed(vertices_m, TRIANGLES, meshing.WEAK_PASSES, only)
+    smooth_m = meshing.taubin_smoothed(vertices_m, MEANS, meshing.WEAK_PASSES, only)
     np.testing.assert_array_equal(smooth_m[~only], before_m[~only])
     np.testing.assert_array_equal(vertices_m, before_m)
     assert off_m(smooth_m[only]).std() < 0.5 * off_m(before_m[only]).std()
     assert abs(off_m(smooth_m[only]).mean()) < 1e-3 * RADIUS_M
-    everywhere_m = meshing.taubin_smoothed(vertices_m, TRIANGLES, 3)
+    everywhere_m = meshing.taubin_smoothed(vertices_m, MEANS, 3)
     np.testing.assert_allclose(
-        meshing.taubin_smoothed(vertices_m, TRIANGLES, 3, np.ones_like(only)), everywhere_m, atol=1e-12
+        meshing.taubin_smoothed(vertices_m, MEANS, 3, np.ones_like(only)), everywhere_m, atol=1e-12
     )
 
 

@@ -255,8 +255,9 @@ class FusionVolume:
         used, compact = meshing.used_vertices(shown, len(vertices))
         if watertight:
             return self._closed_mesh(field, vertices, used, weak, sigmas_m)
-        smooth = meshing.taubin_smoothed(vertices[used], compact, self.fuser.fairing)
-        smooth = meshing.taubin_smoothed(smooth, compact, meshing.WEAK_PASSES, weak[used])
+        means = meshing.neighbour_means(compact, len(used))
+        smooth = meshing.taubin_smoothed(vertices[used], means, self.fuser.fairing)
+        smooth = meshing.taubin_smoothed(smooth, means, meshing.WEAK_PASSES, weak[used])
         return meshing.without_relief(smooth, compact, sigmas_m[used]), compact, np.ones(len(used), dtype=bool)
 
     def _kept(self, vertices: Array, triangles: meshing.Triangles) -> tuple[BoolArray, BoolArray, BoolArray, Array]:

@@ -240,10 +240,12 @@ def _piece(triangles: Triangles, count: int) -> npt.NDArray[np.int64]:
 
 def boundary_edges(triangles: Triangles) -> npt.NDArray[np.int64]:
     """Return the boundary edges (e, 2): those of one triangle only."""
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    keys = edges[:, 0] * (edges.max(initial=0) + 1) + edges[:, 1]
-    _, first, uses = np.unique(keys, return_index=True, return_counts=True)
-    return edges[first[uses == 1]]
+    one, other = triangles.ravel(), triangles[:, [1, 2, 0]].ravel()
+    low, high = np.minimum(one, other), np.maximum(one, other)
+    size = int(high.max(initial=-1)) + 1
+    uses = coo_array((np.ones(len(low), dtype=np.int64), (low, high)), shape=(size, size)).tocsr()
+    first = np.repeat(np.arange(size), np.diff(uses.indptr))
+    return np.stack([first, uses.indices], axis=1)[uses.data == 1]
 
 
 def dilated(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
@@ -299,28 +301,35 @@ def spikes_removed(marked: BoolArray, triangles: Triangles, rings: int) -> BoolA
     return core
 
 
-def taubin_smoothed(vertices_m: Array, triangles: Triangles, passes: int, only: BoolArray | None = None) -> Array:
+def taubin_smoothed(vertices_m: Array, means: csr_array, passes: int, only: BoolArray | None = None) -> Array:
     """Return vertices (v, 3) smoothed by a low-pass filter that does not shrink the mesh.
 
     Each pass is a step towards the neighbours' mean and a slightly longer one back (Taubin 1995, "A signal processing
-    approach to fair surface design"). Vertices on the boundary follow their neighbours on it alone.
+    approach to fair surface design").
 
     Args:
         vertices_m: (v, 3).
-        triangles: (t, 3).
+        means: (v, v) from vertices to the means of their neighbours, see `neighbour_means`.
         passes: number of passes.
         only: which vertices (v,) move; None: all.
     """
+    moving = slice(None) if only is None else np.flatnonzero(only)
+    means, vertices_m = means[moving], vertices_m.copy()
+    for step in [0.5, -0.53] * passes:  # pass band at 1 / 0.5 - 1 / 0.53 = 0.11, as Taubin proposes
+        vertices_m[moving] += step * (means @ vertices_m - vertices_m[moving])
+    return vertices_m
+
+
+def neighbour_means(triangles: Triangles, count: int) -> csr_array:
+    """Return the matrix (v, v) from `count` vertices to the means of their neighbours.
+
+    Vertices on the boundary follow their neighbours on it alone.
+    """
     border = boundary_edges(triangles)
-    on_border = np.zeros(len(vertices_m), dtype=bool)
+    on_border = np.zeros(count, dtype=bool)
     on_border[border] = True
     pairs = _neighbours(triangles)
-    pairs = np.concatenate([pairs[~on_border[pairs[:, 0]]], border, border[:, ::-1]])
-    moving = np.arange(len(vertices_m)) if only is None else np.flatnonzero(only)
-    mean, vertices_m = _means(pairs, len(vertices_m))[moving], vertices_m.copy()
-    for step in [0.5, -0.53] * passes:  # pass band at 1 / 0.5 - 1 / 0.53 = 0.11, as Taubin proposes
-        vertices_m[moving] += step * (mean @ vertices_m - vertices_m[moving])
-    return vertices_m
+    return _means(np.concatenate([pairs[~on_border[pairs[:, 0]]], border, border[:, ::-1]]), count)
 
 
 def without_relief(vertices_m: Array, triangles: Triangles, limits_m: Array) -> Array:

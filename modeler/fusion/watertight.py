@@ -138,13 +138,14 @@ def cleaned(
     vertices_m = vertices_m[used]
     away_m, nearest = KDTree(shown_m).query(vertices_m, distance_upper_bound=voxel_m)
     shown = away_m < voxel_m
-    vertices_m = meshing.taubin_smoothed(vertices_m, triangles, passes)
+    means = meshing.neighbour_means(triangles, len(vertices_m))
+    vertices_m = meshing.taubin_smoothed(vertices_m, means, passes)
     vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, ~shown, SPANNING_PASSES)
     # Support is weak along the seam.
     seam = meshing.dilated(shown, triangles, 1) & meshing.dilated(~shown, triangles, 1)
     vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, seam, SEAM)
     rough = meshing.dilated(seam, triangles, SEAM) | (shown & np.append(weak, False)[nearest])
-    vertices_m = meshing.taubin_smoothed(vertices_m, triangles, meshing.WEAK_PASSES, rough)
+    vertices_m = meshing.taubin_smoothed(vertices_m, means, meshing.WEAK_PASSES, rough)
     limits_m = np.where(shown, np.append(sigmas_m, 0.0)[nearest], 0.0)
     return meshing.without_relief(vertices_m, triangles, limits_m), triangles, shown
 
