@@ -1,5 +1,6 @@
 """Run the command line: as `python -m modeler`, and as the console script `modeler`."""
 
+import gc
 import os
 import signal
 import sys
@@ -7,6 +8,7 @@ import sys
 
 def main() -> int:
     """Run one command and return its exit status."""
+    gc.disable()  # until all is imported: a fiftieth of a build would go to looking for garbage where there is none
     before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during an import ends without a traceback
     from modeler.cli import main as run
 

@@ -6,6 +6,7 @@ where options, input or output cannot be used. Heavy imports are inside function
 
 import contextlib
 import errno
+import gc
 import importlib
 import inspect
 import io
@@ -211,6 +212,9 @@ def _run(command: Command) -> int:
     try:
         with endable():
             _check_names(command)
+            if not gc.isenabled():
+                gc.freeze()  # what is imported lives to the end
+                gc.enable()
             return command.run()
     except InputError as error:
         complain(str(error).strip().removesuffix("."))
