@@ -93,7 +93,7 @@ class Search:
     matcher: FeatureMatcher = field(default_factory=FeatureMatcher)
     """Matches features for further starts, if the prior has more basins than `max_starts` reach."""
     turns: int = 3000
-    """Number of poses along motions that surface leaves open whose colours are compared: 5° apart on a ball."""
+    """Number of poses along three motions that surface leaves open whose colours are compared: 5° apart on a ball."""
     stages: int = 3
     """Stages of the descent, each with half the blur of the previous one."""
     steps: int = 4
@@ -221,8 +221,9 @@ class Search:
         if not silent.shape[1]:
             return poses[:0]
         spread = np.linalg.cholesky(silent.T @ (prior.covariance / np.outer(extent, extent)) @ silent)
-        moves = rng.normal(size=(self.turns, len(spread))) @ (silent @ spread).T * extent
-        moved = se3.moved(np.broadcast_to(best, (self.turns, 4, 4)), moves, pair.centre_m)
+        count = max(round(self.turns ** (min(len(spread), 3) / 3.0)), self.min_starts)  # as far apart as on a ball
+        moves = rng.normal(size=(count, len(spread))) @ (silent @ spread).T * extent
+        moved = se3.moved(np.broadcast_to(best, (count, 4, 4)), moves, pair.centre_m)
         moved = moved[np.isfinite(density.log_prior(moved))]
         colours = pair.scores(moved, coarse_m, stride=_COARSE_STRIDE).colours if len(moved) else np.zeros(0)
         return moved[np.argsort(-colours, kind="stable")[: self.min_starts]]
