@@ -95,8 +95,12 @@ def test_another_object_is_not_there_which_is_an_answer(cli: Run, tmp_path: Path
 
 
 def test_a_folder_with_other_things_is_left_alone(cli: Run, track: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    for out, words in ((tmp_path, "not the folder of a track"), (track, "--overwrite")):
+    killed, other = tmp_path / "killed", tmp_path / "other"
+    for folder in (killed, other):
+        folder.mkdir()
+    (other / "mine.txt").write_text("mine")
+    (killed / f".poses.json.{2**30}.part").touch()  # by a process that is no more
+    for out, words in ((other, "not the folder of a track"), (track, "--overwrite"), (killed, "--overwrite")):
         ended = cli("track", BOX / "model.ply", BOX, "--out", out, *FEW)
         assert (ended.status, ended.out) == (2, "")
         assert words in ended.err

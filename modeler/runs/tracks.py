@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from modeler.export import tum_text, write_atomically
+from modeler.export.files import PART
 from modeler.system.concurrency import Pace
+from modeler.system.regular_files import left_behind
 from modeler.tracking import Tracked
 from modeler.types import InputError, PoseGaussian
 
@@ -44,7 +46,8 @@ class TrackFolder:
         if not self.path.is_dir():
             raise InputError(f"{self.path}: is no folder; choose another `out`")
         names = {entry.name for entry in self.path.iterdir()}
-        if names - {*FILES}:
+        of_kills = {left.name for name in FILES for left in left_behind(self.path / name, PART)}
+        if names - {*FILES} - of_kills:
             raise InputError(f"{self.path}: not empty, and not the folder of a track; choose another `out`")
         if names and not overwrite:
             raise InputError(f"{self.path}: not empty; choose another `out`, or give `overwrite`")

@@ -31,6 +31,9 @@ COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
     "report": ("report", "a", "--out", "made/out.html"),
     "evaluate": ("evaluate", "rendered", "--methods", "icp", "--out", "made/out"),
     "join": ("join", "a", "b", "--out", "made/out"),
+    "edit": ("edit", "a", "--drop", "2", "--out", "made/out"),
+    "build on a model": ("build", "s", "--model", "a", "--out", "made/out"),
+    "track": ("track", "a", "s", "--out", "made/out"),
     "gallery": ("gallery", "made/runs", "--out", "made/runs/gallery.html"),
 }
 """Arguments; names are relative to the folder of the inputs."""
