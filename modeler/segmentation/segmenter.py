@@ -32,7 +32,6 @@ _CHANGES = 2.0
 """Largest ratio of the spread from frame to frame to the noise within frames at the image's rim, where this is at least
 the expected one: noise of a camera that stands still is the same in both to its fixed pattern, which only lowers it."""
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
-_SPECKS = 0.01  # share of a mask near a plane that it held some of: 0 before a wall, 0.03 to 0.05 on a support
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 
 _Look = tuple[Frame, Found]
@@ -117,10 +116,9 @@ class Segmenter:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
         A frame's own mask is kept, within region and largest depth; it is CUT_OFF if it goes on beyond the image. What
-        noise does not tell from the support, or from a wall behind, is left out, unless it is most of the mask. If that
-        was much of it and more is close to the plane, it is UNSURE_MASK, as its rim may lie on more than that. For
-        sparse measurements, the mask includes the gaps between those of the object. Where its own mask leaves the rim
-        out, an object is modelled as far as it is seen.
+        noise does not tell from the support, or from a wall behind, is left out; if that is most of the mask, it is kept and
+        UNSURE_MASK, as it may show the support. For sparse measurements, the mask includes the gaps between those of
+        the object. Where its own mask leaves the rim out, an object is modelled as far as it is seen.
         """
         frame = _interpolated(frame)
         if frame.mask is not None:
@@ -128,16 +126,14 @@ class Segmenter:
             few = np.count_nonzero(mask & (frame.depth_m > 0.0)) < self.min_points
             plane = None if few else self._plane_beside(frame, mask)
             share = 0.0 if plane is None else self._share_on(plane, frame, mask, scene.range_noise)
-            loose = share > _LOOSE_SHARE
-            if plane is not None and loose and share <= 0.5:
+            if plane is not None and _LOOSE_SHARE < share <= 0.5:
                 mask = mask & ~self._on(plane, frame, scene.range_noise)
-                # Of the plane, noise leaves specks near it; of an object on it, more.
+                # Noise leaves specks near the plane.
                 near = self._on(plane, frame, scene.range_noise, reach=2.0)
                 mask = mask & (~near | np.asarray(ndimage.binary_opening(mask, iterations=2), dtype=np.bool_))
-                loose = np.count_nonzero(mask & near) > _SPECKS * np.count_nonzero(mask)
             stride = planning_stride(frame.camera)
             cut = is_cut(mask, edge_of(np.isfinite(_measured(frame)[::stride, ::stride])))
-            outcome = Outcome.UNSURE_MASK if loose else Outcome.CUT_OFF if cut else Outcome.CONVERGED
+            outcome = Outcome.UNSURE_MASK if share > 0.5 else Outcome.CUT_OFF if cut else Outcome.CONVERGED
             return Segmentation(mask, plane, Outcome.TOO_FEW_POINTS if few else outcome)
         if scene.alone:
             mask = clean(self._kept(frame), frame.camera, self.noise)
