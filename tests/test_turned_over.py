@@ -299,7 +299,7 @@ def test_a_pair_that_matches_by_chance_does_not_misplace_all_frames_after_it() -
     assert last.verdict is not None
     assert not last.verdict.trustworthy
     assert all(one.kind != "join" for one in last.edges_so_far)
-    assert [event for event in run.realign() if isinstance(event, Searching)] == [Searching(3)]
+    assert [event for event in run.correct() if isinstance(event, Searching)] == [Searching(3)]
     for frame, pose in run.state.solution.trajectory.items():
         assert rotation_error_deg(pose, true_motion(truth, 0, frame)) < 3.0, frame
     assert lost in run.state.graph.edges
@@ -308,4 +308,4 @@ def test_a_pair_that_matches_by_chance_does_not_misplace_all_frames_after_it() -
     (reason,) = [one.reason for one in across if one.kind == "odometry"]
     assert isinstance(reason, ElsewhereThanSegments)
     assert abs(reason.angle_deg - np.degrees(1.0)) < 3.0
-    assert not any(isinstance(event, Searching) for event in run.realign())  # nothing is contradicted any more
+    assert not any(isinstance(event, Searching) for event in run.correct())  # nothing is contradicted any more

@@ -306,7 +306,7 @@ def _events(run: Run, frames: Iterable[Frame], interrupt: Interrupt, *, live: bo
     else:
         yield from run.track(frames)
     yield from run.revisit()
-    for event in itertools.chain(run.rejoin(), run.refine(), run.realign()):
+    for event in itertools.chain(run.rejoin(), run.refine(), run.correct()):
         yield event
         if interrupt.asked:
             break

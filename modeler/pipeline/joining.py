@@ -36,6 +36,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     Solution,
+    spread,
 )
 
 _ALIGNMENT_SIGMA_RAD = 0.12  # standard deviation of the models' alignment
@@ -315,9 +316,7 @@ class Joiner:
 
     def _spread(self, segment: Segment, count: int) -> dict[int, RayImage]:
         """Return up to `count` views, evenly spread over a segment."""
-        frames = segment.frames
-        chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), count)).astype(int))
-        return {frames[k]: self.ready(segment.views[frames[k]]) for k in chosen}
+        return {frame: self.ready(segment.views[frame]) for frame in spread(segment.frames, count)}
 
     def _pair(self, source: RayImage, target: RayImage) -> PairLikelihood:
         """Return the likelihood of a pair of views."""

@@ -47,9 +47,12 @@ class Realigner:
 
     def free_space(self, state: State, among: Iterable[int] | None = None) -> FreeSpace | None:
         """Return the free-space violations between views of a state, by default all, as the verdict judges them."""
-        tolerance_m = self.tolerance_m or default_tolerance_m([*state.views.values()])
         views = {frame: state.views[frame] for frame in (state.views if among is None else among)}
-        return free_space(views, state.solution.trajectory, tolerance_m)
+        return free_space(views, state.solution.trajectory, self.tolerance(state))
+
+    def tolerance(self, state: State) -> float:
+        """Return the error in m of the surface above which a model is called wrong."""
+        return self.tolerance_m or default_tolerance_m([*state.views.values()], state.solution.variance_factor)
 
     def _aligned_across(self, state: State, before: int, after: int) -> Generator[Searching, None, State | None]:
         """Return a state with another alignment of the frames from one on with those before; None without one.

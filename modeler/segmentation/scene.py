@@ -91,6 +91,11 @@ class Scene:
     """Noise statistics of the camera from planes around the object; None without enough planar surface."""
 
     @property
+    def finds_masks(self) -> bool:
+        """Whether masks are found, not given."""
+        return self.alone or self.zone_m is not None
+
+    @property
     def doubts(self) -> tuple[str, ...]:
         """What may be wrong with the capture, in words."""
         if self.camera_moves:

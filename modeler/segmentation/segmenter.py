@@ -116,9 +116,9 @@ class Segmenter:
         """Return the object's mask and its support plane in a frame. Failure is the outcome, never an exception.
 
         A frame's own mask is kept, within region and largest depth; it is CUT_OFF if it goes on beyond the image. What
-        noise does not tell from the support, or from a wall behind, is left out; if that is most of the mask, it is kept and
-        UNSURE_MASK, as it may show the support. For sparse measurements, the mask includes the gaps between those of
-        the object. Where its own mask leaves the rim out, an object is modelled as far as it is seen.
+        noise does not tell from the support, or from a wall behind, is left out; if that is most of the mask, it is
+        kept and UNSURE_MASK, as it may show the support. For sparse measurements, the mask includes the gaps between
+        those of the object. Where its own mask leaves the rim out, an object is modelled as far as it is seen.
         """
         frame = _interpolated(frame)
         if frame.mask is not None:

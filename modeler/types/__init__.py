@@ -10,6 +10,7 @@ from modeler.types.base import BoolArray as BoolArray
 from modeler.types.base import Float32Array as Float32Array
 from modeler.types.base import InputError as InputError
 from modeler.types.base import Outcome as Outcome
+from modeler.types.base import spread as spread
 from modeler.types.interfaces import AbstractPairCache as AbstractPairCache
 from modeler.types.interfaces import AbstractPoseDensity as AbstractPoseDensity
 from modeler.types.interfaces import AbstractPrior as AbstractPrior

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -10,10 +12,17 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 Float32Array = npt.NDArray[np.float32]
+T = TypeVar("T")
 
 
 class InputError(Exception):
     """Unusable input, in one line: what is wrong, where, and what to do. Commands exit with status 2."""
+
+
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """Return all items, or `most` of them that are evenly spread."""
+    places = np.linspace(0, len(items) - 1, min(len(items), most)).astype(int)
+    return [items[place] for place in np.unique(places)]
 
 
 class Outcome(enum.Enum):

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from modeler import se3
 from modeler.kernels.colour_fit import displaced_correlations
-from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage
+from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage, spread
 
 MAX_VIEWS: Final = 40  # spread over the run: steps of 9° in a full turn
 _PAIRS: Final = 12  # of views that are compared, spread over the run: one has a sd of some 0.1
@@ -115,15 +115,13 @@ def has_colour(view: RayImage) -> bool:
 
 def _spread(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> list[tuple[int, int]]:
     """Return pairs of views that share surface, spread over the run."""
-    frames, found = list(views), []
-    frames = [frames[number] for number in np.unique(np.linspace(0, len(frames) - 1, MAX_VIEWS).astype(int))]
+    frames, found = spread(list(views), MAX_VIEWS), []
     for place, first in enumerate(frames):
         for second in frames[place + 1 :]:
             angle_deg = np.degrees(se3.rotation_angle(se3.inverse(trajectory[first]) @ trajectory[second]))
             if NEAR_DEG <= angle_deg <= FAR_DEG:
                 found.append((first, second))
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), _PAIRS)).astype(int)) if found else []
-    return [found[number] for number in chosen]
+    return spread(found, _PAIRS)
 
 
 @final

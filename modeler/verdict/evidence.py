@@ -24,6 +24,7 @@ from modeler.types import (
     LoopClosureError,
     RayImage,
     Solution,
+    spread,
 )
 
 MAX_UNSURE: Final = 0.5
@@ -347,9 +348,8 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
         tolerance_m: error of the surface above which a model is wrong.
     """
     frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MAX_VIEWS)).astype(int))
-    frames = [frames[k] for k in chosen]
-    reaches_m = {frame: _nearest_around(views[frame]) for frame in frames}
+    frames = spread(frames, _MAX_VIEWS)
+    reaches_m = {frame: nearest_around(views[frame]) for frame in frames}
     looks, absent = np.zeros((2, len(frames), len(frames))), np.zeros((len(frames), 2))
     surface: list[Array] = []  # by frame: of it in the free space of others, and of others in its free space
     free: list[list[Array]] = [[] for _ in frames]
@@ -360,7 +360,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
             if other != frame:
                 target_from_source = se3.inverse(trajectory[other]) @ trajectory[frame]
                 carried_m, turned = se3.transform(target_from_source, points_m), normals @ target_from_source[:3, :3].T
-                beyond_m = _beyond(views[other], reaches_m[other], carried_m, turned)
+                beyond_m = beyond(views[other], reaches_m[other], carried_m, turned)
                 found = np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
                 tally += found
                 free[column].append(pixels_of(views[other], carried_m[found[0]]))
@@ -395,21 +395,26 @@ def _facing(view: RayImage) -> tuple[Array, Array, np.ndarray]:
     mask = np.isfinite(view.frame.depth_m) if view.frame.mask is None else view.frame.mask
     inner = ndimage.minimum_filter(mask, size=2 * _MARGIN_PX + 1, mode="nearest")[view.pixels[:, 0], view.pixels[:, 1]]
     some = np.flatnonzero(inner)[:: max(np.count_nonzero(inner) // MAX_POINTS, 1)]
-    some = some[_face_camera(view.points_m[some], view.normals[some])]
+    some = some[faces_camera(view.points_m[some], view.normals[some])]
     return view.points_m[some], view.normals[some], view.pixels[some]
 
 
-def _face_camera(points_m: Array, normals: Array) -> BoolArray:
+def faces_camera(points_m: Array, normals: Array) -> BoolArray:
     """Return which (n,) points (n, 3) in camera coordinates with normals (n, 3) face the camera."""
     return -np.sum(points_m * normals, axis=1) >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
 
 
-def _nearest_around(view: RayImage) -> Array:
-    """Return the least depth (h, w) in m around each pixel; NaN where the pixel measured nothing."""
+def nearest_around(view: RayImage, *, far_gaps: bool = False) -> Array:
+    """Return the least depth (h, w) in m around each pixel; NaN where the pixel measured nothing.
+
+    Args:
+        view: the view.
+        far_gaps: whether such pixels have what is around them, and infinity where nothing was measured there either.
+    """
     depth_m = np.asarray(view.frame.depth_m, dtype=np.float64)
     measured = np.isfinite(depth_m) & (depth_m > 0.0)
     near_m = ndimage.minimum_filter(np.where(measured, depth_m, np.inf), size=2 * _MARGIN_PX + 1, mode="nearest")
-    return np.where(measured, near_m, np.nan)
+    return near_m if far_gaps else np.where(measured, near_m, np.nan)
 
 
 def pixels_of(view: RayImage, points_m: Array) -> Array:
@@ -418,7 +423,7 @@ def pixels_of(view: RayImage, points_m: Array) -> Array:
     return np.rint(np.column_stack([camera.fy * y / z + camera.cy, camera.fx * x / z + camera.cx]))
 
 
-def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
+def beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
     """Return the distances (n,) in m that a view measured beyond points; NaN for those that do not face its camera.
 
     Args:
@@ -428,7 +433,7 @@ def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> A
         normals: (n, 3) unit.
     """
     depth_m = points_m[:, 2]
-    ahead = np.flatnonzero(_face_camera(points_m, normals) & (depth_m > 0.0))
+    ahead = np.flatnonzero(faces_camera(points_m, normals) & (depth_m > 0.0))
     rows, columns = pixels_of(view, points_m[ahead]).T
     height, width = near_m.shape
     inside = (columns >= _MARGIN_PX) & (columns < width - _MARGIN_PX)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.priors.general import LARGE_DEG
-from modeler.types import AbstractPrior, Array, Check, InputError, RayImage, components
+from modeler.types import AbstractPrior, Array, Check, InputError, RayImage, components, spread
 from modeler.verdict.colour_fit import (
     AT_LEAST,
     FAR_DEG,
@@ -92,7 +92,7 @@ def likenesses(
         colour: whether print is compared.
     """
     frames = [frame for frame in sorted(trajectory) if frame in views and len(views[frame].points_m)]
-    frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, MAX_VIEWS).astype(int))] if frames else []
+    frames = spread(frames, MAX_VIEWS)
     coloured = {frame: views[frame] for frame in frames if colour and has_colour(views[frame])}
     compared = Comparison(coloured, trajectory, ()) if coloured else None
     some = {frame: views[frame].along_curve[:: max(len(views[frame].points_m) // MAX_POINTS, 1)] for frame in frames}

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from modeler import se3
-from modeler.types import Array, Check, Edge, FocalLength, RayImage, Solution
+from modeler.types import Array, Check, Edge, FocalLength, RayImage, Solution, spread
 from modeler.verdict.evidence import MAX_POINTS, MAX_VIOLATIONS, WRONG_RAD, WRONG_SHARE, graph_check
 
 _MOST: Final = 16  # frames whose mean error is none of the model's: 240 motions take a tenth of a second
@@ -59,7 +59,7 @@ class AboutMean:
         frames = sorted(solution.covariances)
         if not solution.knows_motions or len(frames) < 2:
             return cls({k: _given_focal_length(solution, k, None) for k in frames}, dict.fromkeys(frames[:1], 1.0))
-        some = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).astype(np.int64))]
+        some = spread(frames, _MOST)
         to_object = {frame: se3.adjoint(solution.trajectory[frame]) for frame in frames}
         apart = {
             (frame, other): to_object[frame] @ _given_focal_length(solution, frame, other) @ to_object[frame].T

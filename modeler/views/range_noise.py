@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from modeler.types import Array, BoolArray, Float32Array, Frame
+from modeler.types import Array, BoolArray, Float32Array, Frame, spread
 
 _TILES_PX: Final = (48, 24)  # the first size with enough tiles: 24 px hold half of the area on captures, 96 px bends
 _MIN_TILES: Final = 10  # of a size; 5 or 20 give the same on captures
@@ -47,8 +47,7 @@ def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
     Args:
         looks: frames with masks (h, w) of the object, of which a few are looked at. Pixels without depth are 0 or NaN.
     """
-    few = [looks[k] for k in np.linspace(0, len(looks) - 1, min(_FRAMES, len(looks))).astype(np.int64).tolist()]
-    images = [_inverse(frame.depth_m, mask) for frame, mask in few]
+    images = [_inverse(frame.depth_m, mask) for frame, mask in spread(looks, _FRAMES)]
     for tile_px in _TILES_PX:
         residuals = [_left_of_planes(image, tile_px) for image in images]
         limit = _NOT_PLANE * _median_variance(residuals)

@@ -94,7 +94,7 @@ def demonstrate(recipe: Recipe, folder: RunFolder, stream: RerunStream, goal: Go
     sequence = robot.stage.sequence
     facts = {"name": recipe.name, "sensor": sequence.sensor()._asdict(), "source": "rendered"}
     write_bop(Path(meta.sequence), sequence, sequence.truth(), facts, depth_scale_mm=recipe.depth_unit_mm)
-    for _ in chain(run.refine(), run.realign()):
+    for _ in chain(run.refine(), run.correct()):
         pass
     last = [event for event in run.finish() if isinstance(event, Step)][-1]
     stream(last)

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.pipeline import Modeler
-from modeler.pipeline.modeler import Run
+from modeler.pipeline import Modeler, Run
 from modeler.priors import TablePrior
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest

@@ -84,7 +84,7 @@ def followed(shape: str) -> int:
                     if first_model_s == np.inf and event.model is not None:
                         first_model_s = time.monotonic() - began_s
             tracked_s = time.monotonic() - began_s
-            phases = (run.fill(newest.skipped), run.revisit(), run.rejoin(), run.refine(), run.realign(), run.finish())
+            phases = (run.fill(newest.skipped), run.revisit(), run.rejoin(), run.refine(), run.correct(), run.finish())
             for event in chain.from_iterable(phases):
                 if isinstance(event, Step):
                     folder.write(event, meta)

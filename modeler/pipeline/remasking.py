@@ -1,0 +1,104 @@
+"""Masks anew, without surface that does not move with the object, such as an arm that holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+
+from modeler import se3
+from modeler.pipeline.pairs import Prepared
+from modeler.types import Array, BoolArray, Outcome, RayImage, Segmentation, spread
+from modeler.verdict.evidence import beyond, faces_camera, nearest_around
+from modeler.views import Sensor
+
+MAX_ROUNDS: Final = 3
+"""How often masks are made anew: better masks make better poses, which make better masks."""
+_SETTLED: Final = 0.05  # share of the pixels of all masks: rims differ by as much between masks that are both right
+_MAX_VIEWS: Final = 20  # with which a view is compared
+_POINTS: Final = 5000  # of a view that are looked up in others: 1.5 % of its size apart
+_BLUR: Final = 0.04  # of the mask's size, over which looks are pooled; 0.02 and 0.08 give the same masks to 2 %
+
+
+def moving_along(
+    views: Mapping[int, RayImage], others: Mapping[int, RayImage], trajectory: Mapping[int, Array], tolerance_m: float
+) -> dict[int, BoolArray]:
+    """Return the part (h, w) of each view's mask that moves with the object, by frame number.
+
+    A point moves with it if, by the poses, others see surface where it should be more often than nothing: the space is
+    free there, or the camera measured nothing around. Looks are pooled over the image, as free space is found only
+    where something was measured behind; points that no look reaches go with the nearest.
+
+    Args:
+        views: with the masks as found first.
+        others: in which they are looked up, with other masks, which do not matter here.
+        trajectory: object_from_camera (4, 4) by frame number.
+        tolerance_m: error of the surface above which a model is wrong.
+    """
+    chosen = spread([frame for frame in others if frame in trajectory], _MAX_VIEWS)
+    reaches_m = {other: nearest_around(others[other], far_gaps=True) for other in chosen}
+    found = {}
+    for frame, view in views.items():
+        if frame not in trajectory:
+            continue
+        some = view.along_curve[:: max(len(view.points_m) // _POINTS, 1)]
+        some = some[faces_camera(view.points_m[some], view.normals[some])]
+        looks = np.zeros((2, *view.frame.depth_m.shape))
+        rows, columns = view.pixels[some].T
+        for other in chosen:
+            if other != frame:
+                motion = se3.inverse(trajectory[other]) @ trajectory[frame]
+                moved_m, turned = se3.transform(motion, view.points_m[some]), view.normals[some] @ motion[:3, :3].T
+                beyond_m = beyond(others[other], reaches_m[other], moved_m, turned)
+                looks[:, rows, columns] += np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
+        found[frame] = _kept(np.asarray(view.frame.mask), looks)
+    return found
+
+
+def _kept(mask: BoolArray, looks: Array) -> BoolArray:
+    """Return the part (h, w) of a mask that moves with the object.
+
+    Args:
+        mask: (h, w).
+        looks: (2, h, w) number of views with nothing, and with surface, where the point at a pixel should be.
+    """
+    away, there = ndimage.gaussian_filter(looks, (0.0, *[_BLUR * np.sqrt(np.count_nonzero(mask))] * 2))
+    known = mask & (away + there > 0.0)
+    if not known.any():
+        return mask
+    row, column = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
+    moving = np.asarray(away <= there)
+    return np.asarray(mask & moving[row, column], dtype=np.bool_)
+
+
+def settled(masks: Mapping[int, BoolArray], before: Mapping[int, BoolArray]) -> bool:
+    """Return whether masks are those before, but for their rims."""
+    both = [(mask, before[frame]) for frame, mask in masks.items() if frame in before]
+    different = sum(np.count_nonzero(mask ^ other) for mask, other in both)
+    return bool(different <= _SETTLED * sum(np.count_nonzero(mask | other) for mask, other in both))
+
+
+def masks_of(views: Mapping[int, RayImage]) -> dict[int, BoolArray]:
+    """Return the masks (h, w) of views by frame number."""
+    return {frame: np.asarray(view.frame.mask) for frame, view in views.items()}
+
+
+def segmented(view: RayImage, mask: str) -> Prepared:
+    """Return a frame as it was segmented.
+
+    Args:
+        view: with its mask.
+        mask: label of the segmentation's outcome.
+    """
+    found = Segmentation(np.asarray(view.frame.mask), view.plane, Outcome(mask))
+    return Prepared(replace(view.frame, mask=None), found, view)
+
+
+def remasked(prepared: Prepared, mask: BoolArray, sensor: Sensor) -> Prepared:
+    """Return a frame with another mask (h, w)."""
+    found = replace(prepared.segmentation, mask=mask)
+    view = sensor.ray_image(replace(prepared.frame, mask=mask), found.plane)
+    return Prepared(prepared.frame, found, view if len(view.points_m) else None)
