@@ -31,6 +31,7 @@ _LEVEL = np.cos(np.radians(2.0))
 _LEVEL_BONUS = 1.5  # factor on the votes for level planes
 _PARALLEL = np.cos(np.radians(6.0))  # between the normals of parallel planes, given the accuracy of small ones
 _ABOVE_SHARE = 0.98  # share of an object above its support
+_OVERHANG = 1.0  # of its size, at most, from the support to where it is seen: bodies that overhang 0.7, balls 0.3
 _TOUCHING_SHARE = 0.1  # share of an object's size: 0.04 to 0.06 are left above a support, 0.2 before a near wall
 _REACH_SIZES = 1.5  # radius of an object's surroundings, in sizes of the object
 _MAX_GROUND = 6000  # points; more do not help, since their errors are correlated
@@ -244,7 +245,7 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
         height = heights(body, plane)
         seen = np.count_nonzero(np.abs(heights(ground, plane)) < np.median(tolerance))
         lowest, low = np.percentile(height, [1, 5])
-        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and low < 0.5 * size
+        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and low < _OVERHANG * size
         holds &= lowest < _TOUCHING_SHARE * size or plane[1] < _UPRIGHT
         merit = (int(grade), -float(np.median(height)))
         if seen >= _MIN_POINTS and holds and merit > best:
