@@ -230,7 +230,7 @@ class Run:
     def _remasked(
         self, realigner: Realigner, before: State, free: FreeSpace
     ) -> Generator[Step | Searching | Refining, None, tuple[State, FreeSpace]]:
-        """Build the model anew of what moves with the object, while it violates free space less.
+        """Build the model anew of what moves with the object, while it violates free space less and keeps its frames.
 
         Args:
             realigner: judges it.
@@ -261,7 +261,8 @@ class Run:
             unsolved = other.state
             other._solve()
             again = realigner.free_space(other.state)
-            if again is None or again.excess >= free.excess:
+            fewer = len(unsolved.views) < len(before.views)
+            if fewer or again is None or again.excess >= free.excess:
                 break
             before, free, kept = unsolved, again, other
         if kept is not self:
@@ -269,7 +270,7 @@ class Run:
             shown = self.state.newest is None or self.state.newest.view is not None
             found = kept.state if shown else replace(kept.state, newest=self.state.newest)
             self.state = self._solved = found
-            for frame in known:
+            for frame in (frame for frame in known if frame in found.views or frame in found.lost):
                 one = self._again(found.views[frame]) if frame in found.views else found.lost[frame]
                 edges = [edge for edge in found.graph.edges if edge.source == frame and edge.kind != "span"]
                 yield self._step(one, [edge.posterior for edge in edges], edges)
