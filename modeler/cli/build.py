@@ -279,9 +279,6 @@ def _run(
                     seconds["total"] = time.perf_counter() - began_s
                     meta = replace(meta, seconds=dict(seconds))
                     report = folder.write(event, meta)
-                    # Computed here, before the next frame: the time of the first request decides the linearisation
-                    # point of later ones, and so their last digits.
-                    event.solution.covariances.values()
                     draw(event)
                     # Frames that were skipped are added once it is too late for advice.
                     if followed and not event.last and event.frame.index >= max(event.views, default=0):

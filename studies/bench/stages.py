@@ -5,6 +5,7 @@ Every stage counts without the stages that it calls, so that they add up; the op
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import tempfile
@@ -25,10 +26,10 @@ STAGES: Final = {
     "modeler.kernels.cache.KernelCache.load_overload": "loading kernels",
     "modeler.pipeline.pairs.Registrations.register": "registration",
     "modeler.pipeline.tracking.Tracker.again": "registration",
-    "modeler.pipeline.modeler.Run._solve": "focal length and graph",
+    "modeler.pipeline.run.Run._solve": "focal length and graph",
     "modeler.fusion.fuser.Fuser.fuse": "fusion",
-    "modeler.pipeline.modeler.widened": "fusion",
-    "modeler.pipeline.modeler.judged": "verdict",
+    "modeler.pipeline.run.widened": "fusion",
+    "modeler.pipeline.run.judged": "verdict",
     "modeler.viz.stream.RerunStream.__call__": "recording and previews",
     "modeler.viz.stream.RerunStream.close": "recording and previews",
     "modeler.export.run_folder.RunFolder.write": "files",
@@ -72,6 +73,7 @@ class Clock:
 
 def main() -> int:
     """Build, and print the table."""
+    gc.disable()  # as the program does until all is imported
     os.environ |= {"NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     clock = Clock()
     clock.seconds[IMPORTS] = time.process_time()
