@@ -415,6 +415,14 @@ def test_masks_that_leave_the_rim_out_are_kept(rng):
             np.testing.assert_array_equal(one.mask, thin)
 
 
+def test_a_table_is_seen_below_a_masked_object_that_overhangs_it_but_not_one_in_the_air(rng):
+    for height_m, found in ((0.13, True), (0.3, False)):
+        world = World(tilt_deg=65.0).table().box((0.0, 0.0, height_m), (0.06, 0.06, 0.01), turn_deg=20.0, label=OBJECT)
+        frame, mask = world.frame(0, rng)
+        one = Segmenter().segment(replace(frame, mask=mask), Scene())
+        assert (one.plane is not None) is found
+
+
 def test_a_masked_object_before_nothing_has_no_plane(rng):
     frame, mask = World().box((0.0, 0.0, 0.0), (0.06, 0.06, 0.06), label=OBJECT).frame(0, rng)
     one = Segmenter().segment(replace(frame, mask=mask), Scene())
