@@ -9,7 +9,7 @@ from segmentation_worlds import OBJECT, World, iou
 
 from modeler import Modeler, se3
 from modeler.evaluation import rotation_error_deg
-from modeler.pipeline.remasking import moving_along, settled
+from modeler.pipeline.remasking import LEAST_TURN_DEG, moving_along, settled, turned_deg
 from modeler.segmentation import Scene
 from modeler.types import Refining, Searching, Step
 from modeler.views import Sensor
@@ -18,7 +18,7 @@ STEP_DEG = 25.0
 TOLERANCE_M = 0.005
 
 
-def held(count, rng, *, wall, arm=True):
+def held(count, rng, *, wall, arm=0.03):
     """Return frames of a stepped block that an arm holds, the pixels of both and of the object, and true poses."""
     frames, both, masks, poses = [], [], [], {}
     for k in range(count):
@@ -27,7 +27,7 @@ def held(count, rng, *, wall, arm=True):
         world.box(turn @ (0.02, 0.0, 0.0), (0.09, 0.05, 0.04), turn_deg=STEP_DEG * k, label=OBJECT)
         world.box(turn @ (-0.03, 0.02, 0.07), (0.04, 0.03, 0.05), turn_deg=STEP_DEG * k, label=OBJECT)
         if arm:
-            world.box((0.24, -0.01 * (k % 2), -0.02), (0.14, 0.03, 0.03), turn_deg=2.0 * (-1) ** k)
+            world.box((0.24, -0.01 * (k % 2), -0.02), (0.14, arm, arm), turn_deg=2.0 * (-1) ** k)
         both.append(np.isfinite(world.frame(k, rng)[0].depth_m))
         if wall:
             world.box((0.0, 0.5, 0.0), (1.5, 0.01, 1.5))
@@ -44,7 +44,7 @@ def held(count, rng, *, wall, arm=True):
 @pytest.mark.parametrize("wall", [False, True])
 def test_by_the_poses_an_arm_is_left_out_and_the_object_stays(wall, rng):
     frames, both, masks, poses = held(8, rng, wall=wall)
-    alone, _, _, _ = held(8, rng, wall=wall, arm=False)
+    alone, _, _, _ = held(8, rng, wall=wall, arm=0.0)
     sensor = Sensor()
     views = {k: sensor.ray_image(replace(frames[k], mask=both[k])) for k in poses}
     assert np.mean([iou(one, mask) for one, mask in zip(both, masks, strict=True)]) < 0.75
@@ -63,6 +63,20 @@ def test_frames_without_a_pose_say_nothing(rng):
     assert moving_along(views, views, {}, TOLERANCE_M) == {}
     (only,) = moving_along(views, views, {0: poses[0]}, TOLERANCE_M).values()
     np.testing.assert_array_equal(only, masks[0])  # nothing to compare it with
+
+
+def test_an_arm_larger_than_the_object_is_told_from_it_by_how_far_both_turn(rng):
+    frames, _, masks, poses = held(6, rng, wall=False, arm=0.06)
+    assert abs(turned_deg(poses) - 5 * STEP_DEG) < 1e-6
+    modeler = Modeler()
+    run = modeler.start(modeler.segmenter.scene(frames))
+    list(run.track(frames))
+    assert turned_deg(run.state.solution.trajectory) < 0.3 * LEAST_TURN_DEG
+    list(run.correct())
+    for k in range(2, 6):  # the object was registered after all
+        found = run.state.solution.relative(1, k)
+        assert rotation_error_deg(found, se3.inverse(poses[1]) @ poses[k]) < 3.0
+        assert iou(np.asarray(run.state.views[k].frame.mask), masks[k]) > 0.7
 
 
 def test_a_model_is_built_anew_without_the_arm(rng):

@@ -245,7 +245,7 @@ def boundary_edges(triangles: Triangles) -> npt.NDArray[np.int64]:
     size = int(high.max(initial=-1)) + 1
     uses = coo_array((np.ones(len(low), dtype=np.int64), (low, high)), shape=(size, size)).tocsr()
     first = np.repeat(np.arange(size), np.diff(uses.indptr))
-    return np.stack([first, uses.indices], axis=1)[uses.data == 1]
+    return np.stack([first, uses.indices], axis=1, dtype=np.int64)[uses.data == 1]
 
 
 def dilated(marked: BoolArray, triangles: Triangles, rings: int) -> BoolArray:

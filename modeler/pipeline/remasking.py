@@ -17,6 +17,9 @@ from modeler.views import Sensor
 
 MAX_ROUNDS: Final = 3
 """How often masks are made anew: better masks make better poses, which make better masks."""
+LEAST_TURN_DEG: Final = 45.0
+"""Largest rotation between two views from which on what was registered is the object: an arm turns less, by 23° where
+one was larger than the object that it turned."""
 _SETTLED: Final = 0.05  # share of the pixels of all masks: rims differ by as much between masks that are both right
 _MAX_VIEWS: Final = 20  # with which a view is compared
 _POINTS: Final = 5000  # of a view that are looked up in others: 1.5 % of its size apart
@@ -72,6 +75,12 @@ def _kept(mask: BoolArray, looks: Array) -> BoolArray:
     row, column = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
     moving = np.asarray(away <= there)
     return np.asarray(mask & moving[row, column], dtype=np.bool_)
+
+
+def turned_deg(trajectory: Mapping[int, Array]) -> float:
+    """Return the largest rotation in degrees between two views, given object_from_camera (4, 4) by frame number."""
+    poses = np.stack([*trajectory.values()])
+    return max(float(np.degrees(se3.rotation_angle(se3.inverse(pose) @ poses).max())) for pose in poses)
 
 
 def settled(masks: Mapping[int, BoolArray], before: Mapping[int, BoolArray]) -> bool:

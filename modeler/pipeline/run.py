@@ -15,7 +15,16 @@ from modeler.pipeline.attempts import Stage
 from modeler.pipeline.newest import with_last
 from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.realigning import Realigner, joined
-from modeler.pipeline.remasking import MAX_ROUNDS, masks_of, moving_along, remasked, segmented, settled
+from modeler.pipeline.remasking import (
+    LEAST_TURN_DEG,
+    MAX_ROUNDS,
+    masks_of,
+    moving_along,
+    remasked,
+    segmented,
+    settled,
+    turned_deg,
+)
 from modeler.pipeline.state import Placed, State
 from modeler.segmentation import Scene
 from modeler.system.concurrency import prefetching
@@ -243,9 +252,12 @@ class Run:
         known = {**before.lost, **{frame: self._again(view) for frame, view in before.views.items()}}
         known = {frame: known[frame] for frame in before.places if frame in known}
         views = {frame: one.view for frame, one in known.items() if one.view is not None}
-        masks, kept, newest = masks_of(before.views), self, [*known][-1]
+        masks, current, kept, newest = masks_of(before.views), before, self, [*known][-1]
         for _ in range(MAX_ROUNDS):
-            moving = moving_along(views, before.views, before.solution.trajectory, realigner.tolerance(kept.state))
+            poses = current.solution.trajectory
+            moving = moving_along(views, current.views, poses, realigner.tolerance(current))
+            if arm := turned_deg(poses) < LEAST_TURN_DEG:  # which is larger than the object, so that it was registered
+                moving = {frame: mask & ~moving[frame] for frame, mask in masks_of(views).items() if frame in moving}
             if settled(moving, masks):
                 break
             masks = moving
@@ -258,13 +270,15 @@ class Run:
             for event in chain(other.revisit(), other.rejoin(), other.refine()):
                 if not isinstance(event, Step):
                     yield event
-            unsolved = other.state
+            current = other.state
+            if len(current.views) < len(before.views) or turned_deg(current.solution.trajectory) < LEAST_TURN_DEG:
+                break
             other._solve()
             again = realigner.free_space(other.state)
-            fewer = len(unsolved.views) < len(before.views)
-            if fewer or again is None or again.excess >= free.excess:
+            if again is not None and again.excess < free.excess:
+                before, free, kept = current, again, other
+            elif not arm:
                 break
-            before, free, kept = unsolved, again, other
         if kept is not self:
             self.records.update(kept.records)
             shown = self.state.newest is None or self.state.newest.view is not None
