@@ -28,7 +28,7 @@ _STEP = 0.005  # of finite differences, at most a quarter of the prior's standar
 _REGISTRATIONS = 5  # of the edges at most, each about the estimate so far; eight captures take one to five
 MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
 _GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
-_CONVERGED = 0.8  # sds that derivatives alone may move the estimate at the end: they err by a third of that
+_CONVERGED = 0.25  # standard deviations that the last registration of the edges moves the estimate
 _MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.56 to 1
 _DERIVATIVE_ERROR = 0.3  # relative, of an estimate: 0.26 in the median of ten first steps
 
