@@ -358,10 +358,9 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
         tally = np.zeros((2, len(points_m)))  # per point: frames with it in free space, frames that see it
         for column, other in enumerate(frames):
             if other != frame:
-                target_from_source = se3.inverse(trajectory[other]) @ trajectory[frame]
-                carried_m, turned = se3.transform(target_from_source, points_m), normals @ target_from_source[:3, :3].T
-                beyond_m = beyond(views[other], reaches_m[other], carried_m, turned)
-                found = np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
+                motion = se3.inverse(trajectory[other]) @ trajectory[frame]
+                carried_m, turned = se3.transform(motion, points_m), normals @ motion[:3, :3].T
+                found = looked_up(views[other], reaches_m[other], carried_m, turned, tolerance_m)
                 tally += found
                 free[column].append(pixels_of(views[other], carried_m[found[0]]))
                 looks[:, row, column] = found.sum(axis=1)
@@ -423,7 +422,21 @@ def pixels_of(view: RayImage, points_m: Array) -> Array:
     return np.rint(np.column_stack([camera.fy * y / z + camera.cy, camera.fx * x / z + camera.cx]))
 
 
-def beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
+def looked_up(view: RayImage, near_m: Array, points_m: Array, normals: Array, tolerance_m: float) -> BoolArray:
+    """Return which points lie in the free space of a view, and which on its surface, (2, n).
+
+    Args:
+        view: the view.
+        near_m: (h, w) least depth around each of its pixels, see `nearest_around`.
+        points_m: (n, 3) in its camera's coordinates.
+        normals: (n, 3) unit.
+        tolerance_m: distance up to which a point is on the surface.
+    """
+    beyond_m = _beyond(view, near_m, points_m, normals)
+    return np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
+
+
+def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
     """Return the distances (n,) in m that a view measured beyond points; NaN for those that do not face its camera.
 
     Args:
