@@ -172,6 +172,20 @@ def test_what_nobody_saw_is_trimmed_where_it_curls_at_a_border_and_closes_gaps_h
     )
 
 
+def test_a_rim_ends_where_half_of_the_views_see_the_object_end():
+    """Pixels of a third of the views are off by one upwards, of a third downwards: the rim at the table stays."""
+    off_rad = 1.0 / tabletop.CAMERA.fy
+    seen = {
+        k: tabletop.view(BRICK, se3.exp(np.array([off_rad * (k % 3 - 1), 0, 0, 0, 0, 0])) @ pose, k)
+        for k, pose in enumerate(POSES)
+    }
+    model = FUSER.fuse(seen, tabletop.trajectory(POSES))
+    rim = np.unique(meshing.boundary_edges(model.triangles))
+    below_m = -BRICK.depth_m - model.vertices_m[rim, 2]
+    assert abs(np.median(below_m)) < 0.5 * tabletop.DISTANCE_M / tabletop.CAMERA.fy
+    assert below_m.max() < tabletop.DISTANCE_M / tabletop.CAMERA.fy
+
+
 def test_a_few_wrong_pixels_at_a_flat_angle_dig_no_pit():
     # One view sees the brick's top at a flat angle, and some of it as a patch that faces it and dives into the brick.
     poses = [*POSES, tabletop.turntable(1, tilt_deg=10.0)[0]]

@@ -125,7 +125,7 @@ def crop(view: RayImage, where: tuple[slice, slice], cropping: Cropping) -> Crop
     return Crop(
         index=index,
         free_m=free_of(depth_m, cropping.margin_px),
-        background_m=np.where(measured & ~around, depth_m, 0.0).astype(np.float32),
+        background_m=np.where(measured & ~mask, np.where(around, -depth_m, depth_m), 0.0).astype(np.float32),
         colour=colour,
         intrinsics=intrinsics,
         points_m=points_m[kept],
@@ -187,7 +187,7 @@ class DepthViews:
     free_m: npt.NDArray[np.float32]
     """(f, h, w) depth up to which a pixel sees free space, 0 = unknown."""
     background_m: npt.NDArray[np.float32]
-    """(f, h, w) depth of background pixels with no object pixel nearby, 0 elsewhere."""
+    """(f, h, w) depth of background pixels, negative where an object pixel is near, 0 elsewhere."""
     colour: npt.NDArray[np.uint8]
     """(f, h, w, 3) RGB."""
     coloured: BoolArray

@@ -227,8 +227,9 @@ class FusionVolume:
         )
 
     def _supported(self, found: ViewSupport) -> BoolArray:
-        """Return which points (n,) have more support than views that see them empty."""
-        return found.weight > self.fuser.empty_weight * found.empty_views
+        """Return which points (n,) have more support than views that see them empty, or background in their place."""
+        against = self.fuser.empty_weight * found.empty_views + self.fuser.edge_weight * found.background
+        return found.weight > against  # eq. 12.7
 
     def _cloud(self) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
         """Return the merged points (n, 3), their normals (n, 3) and colours (n, 3)."""
@@ -256,12 +257,15 @@ class FusionVolume:
         if watertight:
             return self._closed_mesh(field, vertices, used, weak, sigmas_m)
         means = meshing.neighbour_means(compact, len(used))
-        smooth = meshing.taubin_smoothed(vertices[used], means, self.fuser.fairing)
+        smooth = meshing.laplacian_smoothed(vertices[used], means, np.isinf(sigmas_m[used]), meshing.SPANNING_PASSES)
+        smooth = meshing.taubin_smoothed(smooth, means, self.fuser.fairing)
         smooth = meshing.taubin_smoothed(smooth, means, meshing.WEAK_PASSES, weak[used])
         return meshing.without_relief(smooth, compact, sigmas_m[used]), compact, np.ones(len(used), dtype=bool)
 
     def _kept(self, vertices: Array, triangles: meshing.Triangles) -> tuple[BoolArray, BoolArray, BoolArray, Array]:
         """Return which vertices (v,) are surface, which of these are confirmed, which are weak, and their sd in m.
+
+        The sd is inf where closing a gap alone makes them surface.
 
         Surface is supported, not seen empty by several views, and does not fold over at a border; more than one view
         confirms it; weak is what has little support.
@@ -278,7 +282,7 @@ class FusionVolume:
         usual = float(np.median(found.weight[marked])) if marked.any() else 0.0
         confirmed = marked & seen & (found.views >= CONFIRMED)
         kept = meshing.spikes_removed(marked, triangles, self.fuser.opening) | confirmed
-        return kept, confirmed, found.weight < meshing.WEAK * usual, found.sigmas_m
+        return kept, confirmed, found.weight < meshing.WEAK * usual, np.where(seen, found.sigmas_m, np.inf)
 
     def _closed_mesh(
         self,

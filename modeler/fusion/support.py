@@ -68,7 +68,7 @@ def exposure_of(views: ViewBlocks, *, tau_m: float, near_m: float) -> Exposure:
     for some in views:
         for view in np.flatnonzero(some.coloured):
             one = some.only(int(view))
-            images = one.colour_weights, one.colour, np.ones((1, 4)), shading, 1.0
+            images = one.background_m, one.colour_weights, one.colour, np.ones((1, 4)), shading, 1.0
             _, colours = tsdf.observe(points_m, normals, near_m, tau_m, *one.lookup, *images)
             levels[row], weights[row] = colours[:, :3], colours[:, 3]
             basis[row] = harmonics_of(normals, one.poses[0])
@@ -171,6 +171,8 @@ class ViewSupport:
     """Number of views that see the point in empty space."""
     views: npt.NDArray[np.int64]
     """Number of views that see surface there."""
+    background: Array
+    """Sum of the cosines, between normal and ray, of the views that measure background where they should see it."""
     sigmas_m: Array
     """Standard deviation of the fused surface along the normal; inf where no view sees surface."""
     colours: npt.NDArray[np.uint8]
@@ -202,7 +204,7 @@ def view_support(
         exposure: what makes the views' colours alike.
         focus: exponent of the view weights for colours; the larger, the more the most frontal view dominates.
     """
-    sums, colours = np.zeros((len(points_m), 5)), np.zeros((len(points_m), 4))
+    sums, colours = np.zeros((len(points_m), 6)), np.zeros((len(points_m), 4))
     start = 0
     for some in views:
         mine = exposure.of(start, start + len(some.index))
@@ -214,7 +216,7 @@ def view_support(
         colours[:, 3] += some_colours[:, 3]
         shares = np.divide(some_colours[:, 3], colours[:, 3], out=np.zeros(len(points_m)), where=colours[:, 3] > 0.0)
         colours[:, :3] += shares[:, None] * (some_colours[:, :3] - colours[:, :3])
-    weight, empty_views, count, first, second = sums.T
+    weight, empty_views, count, first, second, background = sums.T
     found = count > 0.0
     safe = np.where(found, weight, 1.0)
     misfit = np.maximum(second - first**2 / safe, 0.0) / sigma_m**2  # χ² of the views about their mean
@@ -224,6 +226,7 @@ def view_support(
         weight=weight,
         empty_views=empty_views,
         views=count.astype(np.int64),
+        background=background,
         sigmas_m=np.where(found, sigma_m * np.sqrt(scale / safe), np.inf),  # eq. 12.8
         colours=np.rint(np.where(coloured[:, None], colours[:, :3], GREY)).astype(np.uint8),
         coloured=coloured,
@@ -248,6 +251,7 @@ def _observed(
             near_m,
             tau_m,
             *views.lookup,
+            views.background_m,
             views.colour_weights,
             views.colour,
             exposure.gains,

@@ -18,7 +18,6 @@ from modeler.types import Array, BoolArray
 # All chosen by hand.
 CELLS = 80**3  # largest number of cells on which unseen space is classified, which bounds time
 ROUNDS = 400  # of the primal-dual iteration
-SPANNING_PASSES = 60  # of Laplacian smoothing of unseen vertices: with half as many, a closed box is 0.2 % larger
 SEAM = 4  # passes over the seam between seen and unseen surface, and rings next to it that are smoothed like weak ones
 OUTVOTED = 0.1  # largest share of the views of a cell that may be wrong, for their poses err
 OUTER_LAYERS = 3  # layers of voxels at the border of the grid that are outside
@@ -140,10 +139,10 @@ def cleaned(
     shown = away_m < voxel_m
     means = meshing.neighbour_means(triangles, len(vertices_m))
     vertices_m = meshing.taubin_smoothed(vertices_m, means, passes)
-    vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, ~shown, SPANNING_PASSES)
+    vertices_m = meshing.laplacian_smoothed(vertices_m, means, ~shown, meshing.SPANNING_PASSES)
     # Support is weak along the seam.
     seam = meshing.dilated(shown, triangles, 1) & meshing.dilated(~shown, triangles, 1)
-    vertices_m = meshing.laplacian_smoothed(vertices_m, triangles, seam, SEAM)
+    vertices_m = meshing.laplacian_smoothed(vertices_m, means, seam, SEAM)
     rough = meshing.dilated(seam, triangles, SEAM) | (shown & np.append(weak, False)[nearest])
     vertices_m = meshing.taubin_smoothed(vertices_m, means, meshing.WEAK_PASSES, rough)
     limits_m = np.where(shown, np.append(sigmas_m, 0.0)[nearest], 0.0)

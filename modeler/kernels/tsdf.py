@@ -16,7 +16,7 @@ import numpy as np
 from modeler.kernels.cache import njit
 from modeler.kernels.photometric import HARMONICS, harmonics
 from modeler.kernels.threads import over_rows
-from modeler.kernels.votes import SAME_SIDE, above, facing, fuse_votes, project
+from modeler.kernels.votes import SAME_SIDE, above, facing, fuse_votes, project, towards
 
 SIDE = 4  # voxels along the side of a block
 
@@ -178,13 +178,15 @@ def observe(queries, directions, tolerance_m, tau_m, *views):
         tolerance_m: largest distance along the normal.
         tau_m: least distance of empty points from the end of the empty space.
         views: index (f, h, w) int32; free_m (f, h, w) float32; poses (f, 3, 4) camera_from_object; intrinsics (f, 4);
-            points (p, 3), normals (p, 3) and weights (p,); weights of their colours (p,); colour (f, h, w, 3) uint8;
+            points (p, 3), normals (p, 3) and weights (p,); background_m (f, h, w), see `DepthViews`; weights of their
+            colours (p,); colour (f, h, w, 3) uint8;
             gains (f, 4) of red, green and blue, and the weight of a view's colours, 0 = none; shading (8, 3), the
             coefficients of the logarithm of another gain by channel; exponent of the view weights for colours.
 
     Returns:
-        (n, 5): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
-        views, Σ w d and Σ w d² with d the distance of the point above the surface; and (n, 4) RGB with its weight.
+        (n, 6): sum of the supporting views' weights w, number of views that see the point empty, number of supporting
+        views, Σ w d and Σ w d² with d the distance of the point above the surface, and the sum of the cosines between
+        normal and ray of the views that measure background there; and (n, 4) RGB with its weight.
     """
     return over_rows(_observe, np.hstack([queries, directions]), tolerance_m, tau_m, *views)
 
@@ -201,6 +203,7 @@ def _observe(
     points,
     normals,
     weights,
+    background_m,
     colour_weights,
     colour,
     gains,
@@ -208,7 +211,7 @@ def _observe(
     focus,
 ):
     frames, height, width = index.shape
-    observed, colours = np.zeros((len(queries), 5)), np.zeros((len(queries), 4))
+    observed, colours = np.zeros((len(queries), 6)), np.zeros((len(queries), 4))
     directions = queries[:, 3:]
     for q in range(len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
@@ -220,6 +223,9 @@ def _observe(
             n = index[f, row, column]
             if depth < free_m[f, row, column] - tau_m:
                 observed[q, 1] += 1.0
+            behind_m = abs(background_m[f, row, column])
+            if 0.0 < behind_m > depth - tau_m:  # eq. 12.7: the object ends before this pixel, and nothing hides it
+                observed[q, 5] += max(0.0, towards(poses[f], directions, q, x, y, z))
             if n < 0:
                 continue
             along = above(x, y, z, points, normals, n)

@@ -40,6 +40,17 @@ def facing(first, i, second, k):
 
 
 @njit(cache=True)
+def towards(pose, directions, q, x, y, z):
+    """Return the cosine between direction `q` and that from a position of the object frame to a view's camera."""
+    along = square = 0.0
+    for k in range(3):
+        ray = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
+        turned = pose[k, 0] * directions[q, 0] + pose[k, 1] * directions[q, 1] + pose[k, 2] * directions[q, 2]
+        along, square = along - turned * ray, square + ray * ray
+    return along / math.sqrt(square)
+
+
+@njit(cache=True)
 def fuse_votes(
     position,
     seen,
