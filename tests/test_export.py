@@ -38,6 +38,7 @@ from modeler.export.placing import upright
 from modeler.export.reading import fault
 from modeler.fusion import Fuser
 from modeler.runs.reopening import reopened
+from modeler.system.pictures import raycaster, tensor
 from modeler.types import (
     Array,
     InputError,
@@ -264,6 +265,30 @@ def test_simplified_keeps_the_shape_and_what_is_known_of_it() -> None:
     assert simplified(model, 10**6) is model
     with pytest.raises(InputError, match=r"^3 triangles"):
         simplified(model, 3)
+
+
+def test_flat_surface_needs_few_triangles_and_moves_by_less_than_its_deviation(rng: np.random.Generator) -> None:
+    cube = trimesh.creation.box((0.1, 0.1, 0.1))
+    for _ in range(5):
+        cube = cube.subdivide()
+    sigmas_m = np.full(len(cube.vertices), 3e-4)
+    sigmas_m[:50] = np.inf  # interpolated
+    noise_m = 0.1 * sigmas_m[-1] * rng.standard_normal(cube.vertices.shape)
+    model = replace(
+        ball(coloured=False),
+        vertices_m=np.asarray(cube.vertices) + noise_m,
+        triangles=np.asarray(cube.faces, dtype=np.int64),
+        vertex_normals=np.asarray(cube.vertex_normals),
+        vertex_sigmas_m=sigmas_m,
+    )
+    fewer = simplified(model)
+    assert len(fewer.triangles) < 0.1 * len(model.triangles)
+    assert trimesh.Trimesh(fewer.vertices_m, fewer.triangles).is_watertight
+    places = tensor(model.vertices_m.astype(np.float32))
+    away_m = raycaster(fewer.vertices_m, fewer.triangles).compute_distance(places).numpy()
+    assert np.quantile(away_m, 0.99) < 3e-4
+    unknown = replace(model, vertex_sigmas_m=None)
+    assert simplified(unknown) is unknown
 
 
 @pytest.mark.parametrize("suffix", ["obj", "glb"])

@@ -50,8 +50,11 @@ class Export:
     """Up axis: the support's normal; without a support, from the ring of cameras or the image."""
     watertight: bool = False
     """Fill unobserved regions with interpolated surface. In PLY its vertices have 0 `views` and a `sigma_m` of -1."""
-    triangles: Annotated[int | None, tyro.conf.arg(metavar="N"), default("all")] = None
-    """Simplify the mesh to N triangles. With --texture 8000 unless given: the detail is in the image."""
+    triangles: Annotated[
+        int | None, tyro.conf.arg(metavar="N"), default("as few as half a standard deviation allows")
+    ] = None
+    """Simplify the mesh to N triangles. Unless given, those with --texture are 8000 at most, the detail being in the
+    image, and meshes with colours of vertices keep all triangles, since these carry the print."""
     texture: bool = False
     """Colour by an image wrapped around the mesh, from the sharpest frontal views (OBJ with MTL and PNG, GLB)."""
     texture_px: int = 2048
@@ -96,9 +99,12 @@ class Export:
             raise InputError(f"{self.run_folder}: its views give no surface; more of them are needed")
         if self.tint is not None:
             model = files.tinted(model, self.tint)
-        count = self.triangles or (TRIANGLES if self.texture else None)
-        if count is not None:
-            model = files.simplified(model, count)
+        if self.triangles is not None:
+            model = files.simplified(model, self.triangles)
+        elif self.texture:
+            model = files.simplified(files.simplified(model), TRIANGLES)
+        elif model.vertex_colours is None or self.out.suffix.lower() == ".stl":
+            model = files.simplified(model)
         texture = None
         if self.texture and volume is not None:
             if not volume.views.coloured:

@@ -139,8 +139,11 @@ class Preset:
     def _coloured(self, model: ObjectModel) -> tuple[ObjectModel, Texture | None]:
         """Return the mesh, simplified and without degenerate triangles, with its texture where frames have colour."""
         coloured = self._volume.views.coloured
-        count = self.triangles or (TRIANGLES if coloured else _PLAIN_TRIANGLES)
-        model = solids.without_degenerate(files.simplified(model, count))
+        if self.triangles is None:
+            model = files.simplified(files.simplified(model), TRIANGLES if coloured else _PLAIN_TRIANGLES)
+        else:
+            model = files.simplified(model, self.triangles)
+        model = solids.without_degenerate(model)
         if not coloured:
             return model, None
         return files.textured(model, self._volume.texture_colours, self.texture_px)
@@ -166,9 +169,7 @@ class Preset:
 
     def _print(self) -> Checks:
         out = self._mesh
-        model = self._model(watertight=True)
-        if self.triangles is not None:
-            model = files.simplified(model, self.triangles)
+        model = files.simplified(self._model(watertight=True), self.triangles)
         place = files.placement(model, self._reopened.report, "base", "z")
         base_known = place.up_from == "support"
         flat = solids.with_flat_bottom(place.placed(model), self._volume.grid.voxel_m if base_known else None)
