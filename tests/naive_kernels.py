@@ -52,8 +52,8 @@ def visibility(pose, projection, parameters):
     low, high, flat, steep = projection.cosines.astype(np.float64)
     share, per_square_px = projection.pattern.astype(np.float64)
     cells, points = projection.cells.reshape(int(height), int(width), -1), projection.points.T.astype(np.float64)
-    blur, silhouette_px, clearance_m, max_point_cost, normal_cost, unmeasured_gain, typical_misfit = map(
-        np.float64, parameters[:7]
+    blur, silhouette_px, clearance_m, max_point_cost, max_steep_cost, normal_cost, unmeasured_gain, typical_misfit = (
+        map(np.float64, parameters[:8])
     )
     support = parameters.support.astype(np.float64)
     hidden = np.exp(np.float64(parameters.table[0]))
@@ -67,13 +67,14 @@ def visibility(pose, projection, parameters):
         row = int(np.floor(fy * position[1] / position[2] + cy + 0.5))
         inside = position[2] > 0 and 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
         cell = cells[row, column].astype(np.float64) if inside else None
+        covered = np.clip((abs(facing) - flat) / (steep - flat), 0, 1)
         gain = 0.0
         if cell is None or cell[planes.KIND] == planes.MISSING:
-            gain = unmeasured_gain * np.clip((facing - flat) / (steep - flat), 0, 1)
+            gain = unmeasured_gain * covered * faces
         elif cell[planes.KIND] == planes.BACKGROUND:
             beyond = cell[planes.SILHOUETTE] / silhouette_px
             if position[2] < cell[planes.DEPTH] - clearance_m:
-                gain = -min(0.5 * beyond**2, max_point_cost)
+                gain = -min(0.5 * beyond**2, covered * max_point_cost + (1 - covered) * max_steep_cost)
         elif cell[planes.KIND] == planes.SURFACE:
             plane = cell[: planes.NORMAL_Z + 1]
             in_front = plane @ position + cell[planes.DISTANCE]

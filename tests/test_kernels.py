@@ -112,7 +112,7 @@ HIDDEN = 0.3
 
 
 def parameters(blur_m=0.004, support=(0.0, 0.0, 0.0, 0.0, 0.0)):
-    numbers = [np.float32(value) for value in (blur_m, 1.5, 0.006, 10.0, 2.0, -1.2, 0.4)]
+    numbers = [np.float32(value) for value in (blur_m, 1.5, 0.006, 10.0, 1.5, 2.0, -1.2, 0.4)]
     return point_likelihood.LikelihoodParameters(
         *numbers, support=np.array(support, dtype=np.float32), table=point_likelihood.match_table(HIDDEN)
     )
@@ -207,6 +207,22 @@ def test_the_class_of_a_point_follows_from_where_it_lies():
     table = (0.0, -1.0, 0.0, 0.15, 500.0)
     classes = point_likelihood.classify(rows(np.eye(4)), projection, parameters(0.001, table))
     assert classes.tolist() == [want for *_, want in cases]
+
+
+@pytest.mark.parametrize(
+    ("cosine", "want"),
+    [(1.0, -10.0), (0.2, -1.5), (0.0, -1.5), (-0.2, -1.5), (-1.0, -10.0)],
+)
+def test_steep_surface_that_a_camera_replaces_by_the_background_is_little_evidence(cosine, want):
+    cells = np.zeros((*SHAPE, planes.CELL_SIZE), dtype=np.float32)
+    cells[..., planes.DEPTH], cells[..., planes.KIND], cells[..., planes.SILHOUETTE] = 2.0, planes.BACKGROUND, 20.0
+    normal = [np.sqrt(1.0 - cosine**2), 0.0, -cosine]
+    points = np.array([[0.0, 0.0, 0.8, *normal, 1e-6, 0.0, 0.0]], dtype=np.float32).T.copy()
+    projection = Projection(points, cells.reshape(-1, planes.CELL_SIZE), CAMERA, FACING, PATTERN, np.float32(0.0))
+    transformed, pixels, looked_up = point_likelihood.buffers(1)
+    point_likelihood.project(rows(np.eye(4)), projection, transformed, pixels, looked_up)
+    got, _ = point_likelihood.sum_over_points(points, transformed, looked_up, parameters())
+    assert got == pytest.approx(want)
 
 
 @pytest.mark.parametrize("noise_m", [0.01, 0.031])

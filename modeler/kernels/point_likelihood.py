@@ -116,8 +116,8 @@ def transform_points(pose, projection, transformed, pixels):
     Args:
         pose: (12,) rows of the 3×4 matrix.
         projection: the points and the other camera.
-        transformed: (9, n) out: position, normal, visibility f (0..1), expected coverage g (0..1), and the fraction c
-            of a match's variance that is common to both views (eq. 4.9).
+        transformed: (9, n) out: position, normal, visibility f (0..1), expected coverage g (0..1) of surface as steep,
+            and the fraction c of a match's variance that is common to both views (eq. 4.9).
         pixels: (n,) out: index of the pixel on which it falls, row by row; -1 outside the image or behind the camera.
     """
     p0, p1, p2, p3 = np.float32(pose[0]), np.float32(pose[1]), np.float32(pose[2]), np.float32(pose[3])
@@ -148,7 +148,7 @@ def transform_points(pose, projection, transformed, pixels):
             normal_z,
         )
         transformed[FACING, j] = min(max((cosine - low) * per_range, ZERO), ONE)
-        transformed[COVERAGE, j] = min(max((cosine - flat) * per_turn, ZERO), ONE)
+        transformed[COVERAGE, j] = min(max((abs(cosine) - flat) * per_turn, ZERO), ONE)
         across, down = column - HALF - points[COLUMN, j], row - HALF - points[ROW, j]
         correlation = max(ONE - (across * across + down * down) * per_square, ZERO)
         transformed[PATTERN, j] = share * correlation * correlation
@@ -200,6 +200,8 @@ class LikelihoodParameters(NamedTuple):
     """Distance in front of the background from which on a point contradicts it."""
     max_point_cost: np.float32
     """Upper bound K of the cost of one point (nats)."""
+    max_steep_cost: np.float32
+    """The same of steep surface before the background (nats)."""
     normal_cost: np.float32
     """Cost κ of normals at right angles (nats)."""
     unmeasured_gain: np.float32
@@ -293,10 +295,12 @@ def sum_over_points(points, transformed, looked_up, parameters):
         on_surface = faces * seen - ((ONE - faces) * min(half_square, max_point_cost) if in_front > ZERO else ZERO)
         beyond = looked_up[SILHOUETTE, j] / parameters.silhouette_px
         contradicts = transformed[Z, j] < looked_up[DEPTH, j] - parameters.clearance_m
-        on_background = -min(HALF * beyond * beyond, max_point_cost) if contradicts else ZERO
+        covered = transformed[COVERAGE, j]
+        most = covered * max_point_cost + (ONE - covered) * parameters.max_steep_cost
+        on_background = -min(HALF * beyond * beyond, most) if contradicts else ZERO
         gain = on_surface if kind == _OF_SURFACE else ZERO
         gain = on_background if kind == _OF_BACKGROUND else gain
-        gain = parameters.unmeasured_gain * transformed[COVERAGE, j] if kind == _OF_NOTHING else gain
+        gain = parameters.unmeasured_gain * covered * faces if kind == _OF_NOTHING else gain
         below = depth_below(transformed, parameters, j)
         total += max(gain - HALF * below * below, -max_point_cost)
         explained += faces if (kind == _OF_SURFACE) & matches else ZERO

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' lateral noise, which is independent
 _RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
+# Cameras that fill all holes replace surface at cosines below 0.35 by what is behind it: up to 46 % of it in captures
+# without unmeasured pixels near the object, 16 % with one or two in 1,000, 7 % with five, 2 % with more.
+_FILLED = 0.005
 _COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
 MISFIT = 0.5  # mean of r² / 2τ² if variances are right
 
@@ -79,12 +82,15 @@ class DirectedLikelihood:
     def _parameters_of(self, blur_m: float, typical_misfit: float) -> LikelihoodParameters:
         fx = self.image.frame.camera.fx
         lateral_px = max(self.image.sigma_wh * fx, 1.0)
-        missing = max(self.model.hidden_share, 1.0 - self.image.measured_share) if self.model.holes else 1.0
+        unmeasured, most = 1.0 - self.image.measured_share, self.model.max_point_cost
+        missing = max(self.model.hidden_share, unmeasured) if self.model.holes else 1.0
+        steep = most * min(unmeasured / _FILLED, 1.0)
         return LikelihoodParameters(
             blur_m=np.float32(np.hypot(blur_m, self._min_blur_m)),
             silhouette_px=np.float32(_SILHOUETTE_NOISE * lateral_px + blur_m * fx / self._distance_m),
             clearance_m=np.float32(3.0 * self.image.sigma_r_m),
-            max_point_cost=np.float32(self.model.max_point_cost),
+            max_point_cost=np.float32(most),
+            max_steep_cost=np.float32(steep),
             normal_cost=np.float32(self.model.normal_cost),
             unmeasured_gain=np.float32(np.log(missing)),
             typical_misfit=np.float32(typical_misfit),
