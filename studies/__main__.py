@@ -23,7 +23,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "bench.stages": ("processor seconds of a build by stage", "seconds"),
     "calibration": ("calibration of covariances on rendered pairs", "half an hour"),
     "calibration.by_camera": ("the same for cameras other than the renderer's", "20 minutes"),
-    "colour": ("what colour tells: aligned, displaced, faint and natural", "half an hour a core"),
+    "colour": ("what colour tells: aligned, displaced, faint, and under difficult light", "half an hour a core"),
     "far_apart": ("registration of views that are far apart", "3 minutes"),
     "far_apart.few_frames": ("whole models from four or six views", "minutes"),
     "followed": ("draw the model of a run into frames in which it is found, with the region of its place", "a minute"),

@@ -1,11 +1,12 @@
 """Measure what colour tells: `python -m studies colour`.
 
-    python -m studies colour --half held-out --jobs 16     # all parts, once
-    python -m studies colour --parts pairs                 # neighbouring frames of balls, apples and tins
+    python -m studies colour --half held-out --jobs 16 --things things.npz       # all parts, once
+    python -m studies colour --half held-out --parts pairs --things things.npz   # neighbouring frames, a quarter hour
 
 Parts: models of bodies whose colour is `aligned`; the same with `displaced` colour, as another camera or program has
-it; `captures` with colour as it is, left out and displaced; and `pairs`. Bodies are drawn by Open3D's ray casting with
-solid textures. Results are lines of JSON in a file of the folder, and an interrupted study continues.
+it; `captures` with colour as it is, left out and displaced; and `pairs` under difficult light and by poor cameras.
+Bodies are drawn by Open3D's ray casting with solid textures, and with photographs (`python -m studies whole.things`).
+Results are lines of JSON in a file of the folder, and an interrupted study continues.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from pathlib import Path
 from typing import Final
 
 from studies.colour.study import PARTS, SEEDS, cases, measured
-from studies.colour.tables import text
+from studies.colour.tables import bodies, effects, text
+from studies.results.tables import FOLDER, record
 from studies.results_file import earlier_results
 from studies.side_by_side import results
 
@@ -34,22 +36,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--half", choices=tuple(SEEDS), default="tuning", help="which draws")
     parser.add_argument("--parts", choices=PARTS, nargs="+", default=PARTS, help="what is measured")
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of captures")
+    parser.add_argument("--things", type=Path, default=Path("things.npz"), help="file with photographs, for pairs")
+    parser.add_argument("--record", action="store_true", help="put the pairs into the results")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/colour"), help="folder of the results")
     options = parser.parse_args(arguments)
     if options.jobs < 1:
         parser.error("--jobs takes whole numbers from 1 on")
+    if "pairs" in options.parts and not options.things.exists():
+        parser.error(
+            f"{options.things}: there is no such file; `python -m studies whole.things --help` tells how to make it"
+        )
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / f"{options.half}.jsonl"
     done = {one["key"]: one for one in map(json.loads, earlier_results(path))}
     wanted = cases(options.half, tuple(options.parts), options.data)
-    work = [partial(measured, case, options.data) for case in wanted if case.key not in done]
+    work = [partial(measured, case, options.data, options.things) for case in wanted if case.key not in done]
     with path.open("a") as stream:
         for one in results(work, options.jobs):
             done[one["key"]] = one
             print(json.dumps(one), file=stream, flush=True)
             print(f"{len(done)}: {one['key']}, {one['seconds']} s", file=sys.stderr, flush=True)
-    print(text([done[case.key] for case in wanted]))
+    outcomes = [done[case.key] for case in wanted]
+    print(text(outcomes))
+    if options.record:
+        pairs = [one for one in outcomes if one["part"] == "pairs"]
+        record(FOLDER / "colour_effects.json", effects(pairs))
+        record(FOLDER / "colour_bodies.json", bodies(pairs))
     return 0
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal, final
+from typing import Any, Final, Literal, cast, final
 
 import numpy as np
 from PIL import Image
@@ -22,14 +22,31 @@ from modeler.export import RunMeta, report_of
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.sequences import AbstractSequence, GivenSequence, open_sequence, survey
 from modeler.sequences.base import AbstractDerived
-from modeler.types import Array, Frame, InputError, Step
-from studies.colour.scenes import SIZES_PX, Scene
+from modeler.types import AbstractPrior, Array, Frame, InputError, Step
+from studies.colour.scenes import EFFECTS, SIZES_PX, Effect, Picture, Scene
+from studies.whole.things import read
 
 Part = Literal["aligned", "displaced", "captures", "pairs"]
 PARTS: Final[tuple[Part, ...]] = ("aligned", "displaced", "captures", "pairs")
 BODIES: Final = ("ball", "apple", "tin", "box", "bottle", "figure")
 TEXTURES: Final = ("printed", "freckled", "grained", "faint", "plain")
-PAIRED: Final = (("ball", "printed"), ("apple", "freckled"), ("apple", "grained"), ("tin", "printed"), ("tin", "faint"))
+PAIRED: Final = (
+    ("ball", "photograph"),
+    ("apple", "freckled"),
+    ("apple", "grained"),
+    ("tin", "photograph"),
+    ("tin", "faint"),
+    ("mug", "printed"),
+    ("box", "photograph"),
+    ("bottle", "photograph"),
+    ("figure", "grained"),
+    *((body, "plain") for body in ("ball", "apple", "tin", "mug", "box", "bottle")),
+)
+PRIORS: Final[Mapping[str, AbstractPrior]] = {"table": TablePrior(), "general": GeneralPrior()}
+_SIZE: Final = (160, 160)  # of images of pairs: the rest would be of the table
+_FRAMES: Final = 3  # of a body whose pairs are registered
+RIGHT_DEG: Final = 3.0
+"""Largest error of a right pair, if it is not known to be wider."""
 SEEDS: Final[Mapping[str, int]] = {"tuning": 0, "held-out": 1000}
 
 
@@ -104,6 +121,7 @@ class Case:
     texture: str
     """"" for captures."""
     way: str
+    """What is done to colour, or is wrong with light or camera."""
     seed: int
 
     @property
@@ -128,15 +146,22 @@ def cases(half: str, parts: tuple[str, ...], data: Path) -> list[Case]:
     ]
     captures = sorted(path.parent.name for path in data.glob("*/rgb")) if data.is_dir() else []
     found += [Case("captures", name, "", way, 0) for name in captures for way in WAYS]
-    found += [Case("pairs", *one, ALIGNED, seed + 200 + k) for one in PAIRED for k in range(2)]
+    numbers = itertools.count(seed + 200)
+    found += [Case("pairs", *one, effect, next(numbers)) for effect in EFFECTS for one in PAIRED]
     return [case for case in found if case.part in parts]
 
 
-def measured(case: Case, data: Path) -> dict[str, Any]:
-    """Return what a case comes to."""
+def measured(case: Case, data: Path, things: Path) -> dict[str, Any]:
+    """Return what a case comes to.
+
+    Args:
+        case: the case.
+        data: folder of captures.
+        things: file with photographs, see `studies.whole.things`.
+    """
     began = time.perf_counter()
     if case.part == "pairs":
-        found: dict[str, Any] = {"pairs": list(_pairs(case))}
+        found: dict[str, Any] = {"pairs": list(_pairs(case, things))}
     else:
         found = _built(case, data)
     return {"key": case.key, **asdict(case), **found, "seconds": round(time.perf_counter() - began, 1)}
@@ -144,6 +169,14 @@ def measured(case: Case, data: Path) -> dict[str, Any]:
 
 def _scene(case: Case) -> Scene:
     return Scene(case.body, case.texture, case.seed, SIZES_PX.get(case.body, 90.0))
+
+
+def _picture(case: Case, things: Path) -> Picture | None:
+    """Return a photograph of the case's half."""
+    if case.texture != "photograph":
+        return None
+    pictures = read(things)[1][case.seed >= SEEDS["held-out"] :: len(SEEDS)]
+    return pictures[case.seed % len(pictures)]
 
 
 def _built(case: Case, data: Path) -> dict[str, Any]:
@@ -190,14 +223,15 @@ def _errors_deg(trajectory: Mapping[int, Array], truth: Mapping[int, Array] | No
     return [round(float(np.median(errors)), 3), round(float(max(errors)), 3)]
 
 
-def _pairs(case: Case) -> Iterator[dict[str, Any]]:
+def _pairs(case: Case, things: Path) -> Iterator[dict[str, Any]]:
     """Yield the errors of the pairs of neighbouring frames under two priors."""
-    frames, truth = _scene(case).rendered()
+    shown = replace(_scene(case), size=_SIZE, frames=_FRAMES)
+    frames, truth = replace(shown, effect=cast(Effect, case.way), picture=_picture(case, things)).rendered()
     given = GivenSequence.of(frames, live=False)
     modeler = compose.modeler(given, PriorOptions(), MethodOptions(), ObjectOptions())
     scene = compose.scene(modeler, given)
     views = [modeler.prepare(frame, scene).view for frame in frames]
-    for name, prior in (("table", TablePrior()), ("general", GeneralPrior())):
+    for name, prior in PRIORS.items():
         for target, source in itertools.pairwise(views):
             if target is None or source is None:
                 continue
@@ -206,7 +240,7 @@ def _pairs(case: Case) -> Iterator[dict[str, Any]]:
             about = partial(_about, centre_m=source.centroid_m)
             yield {
                 "prior": name,
-                "outcome": posterior.outcome.label,
+                "usable": posterior.usable,
                 "error_deg": round(rotation_error_deg(posterior.pose.mean, motion), 3),
                 "sd_deg": round(float(np.degrees(np.sqrt(np.trace(about(posterior.pose.covariance)[:3, :3])))), 3),
                 "nees": round(nees(posterior.pose, motion), 3),

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from studies.colour.study import ALIGNED
+from studies.colour.study import ALIGNED, PRIORS, RIGHT_DEG
 from studies.results.tables import markdown
 
 Outcome = Mapping[str, Any]
 _CODE = "colour_misaligned"
+_SIGMAS: Final = 3.0  # of a wide result that is right
 
 
 def text(outcomes: Sequence[Outcome]) -> str:
@@ -31,18 +32,7 @@ def text(outcomes: Sequence[Outcome]) -> str:
         columns = ("capture, colour", "placed", "status", "reasons", "loop", "error, median / largest", "built in")
         parts.append(markdown(columns, [capture(one) for one in captures]))
     if pairs := [one for one in outcomes if one["part"] == "pairs"]:
-        columns = ("pairs, 24°", "prior", "pairs", "error, median / largest", "NEES/6, mean / largest", "seconds")
-        names = dict.fromkeys((one["body"], one["texture"]) for one in pairs)
-        rows = [
-            (
-                f"{body}, {texture}",
-                prior,
-                *chain([one for one in pairs if (one["body"], one["texture"]) == (body, texture)], prior),
-            )
-            for body, texture in names
-            for prior in ("table", "general")
-        ]
-        parts.append(markdown(columns, rows))
+        parts += [markdown(EFFECTS, effects(pairs)), markdown(BODIES, bodies(pairs))]
     return "\n\n".join(parts)
 
 
@@ -72,13 +62,53 @@ def capture(one: Outcome) -> tuple[str, ...]:
     )
 
 
-def chain(outcomes: Sequence[Outcome], prior: str) -> tuple[str | int, ...]:
-    """Return number, errors, NEES and seconds of pairs under a prior."""
-    found = [pair for one in outcomes for pair in one["pairs"] if pair["prior"] == prior]
-    errors, squares = ([pair[name] for pair in found] for name in ("error_deg", "nees"))
-    return (
-        len(found),
-        f"{np.median(errors):.2f}° / {max(errors):.1f}°",
-        f"{np.mean(squares) / 6.0:.2f} / {max(squares) / 6.0:.1f}",
-        f"{np.mean([pair['seconds'] for pair in found]):.1f}",
-    )
+EFFECTS: Final = ("light and camera", "usable: error", "NEES/6", "right", "plain: sd", "NEES/6", "right")
+BODIES: Final = ("body", *(f"{prior} prior: {what}" for prior in PRIORS for what in ("error", "sd", "NEES/6", "right")))
+
+
+def effects(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
+    """Return the rows of usable pairs by what is wrong with light or camera, and prior."""
+    rows = []
+    for effect in dict.fromkeys(one["way"] for one in outcomes):
+        for prior in PRIORS:
+            some = [one for one in outcomes if one["way"] == effect]
+            printed, plain = (
+                usable([one for one in some if (one["texture"] == "plain") == bare], prior) for bare in (False, True)
+            )
+            rows.append((f"{effect}, {prior} prior", errors(printed), *trust(printed), width(plain), *trust(plain)))
+    return rows
+
+
+def bodies(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
+    """Return the rows of usable pairs by body, under all lights and by all cameras."""
+    rows = []
+    for body, texture in dict.fromkeys((one["body"], one["texture"]) for one in outcomes):
+        some = [one for one in outcomes if (one["body"], one["texture"]) == (body, texture)]
+        parts = [usable(some, prior) for prior in PRIORS]
+        rows.append(
+            (f"{body}, {texture}", *(cell for part in parts for cell in (errors(part), width(part), *trust(part))))
+        )
+    return rows
+
+
+def usable(outcomes: Sequence[Outcome], prior: str) -> list[Outcome]:
+    """Return the usable pairs under a prior."""
+    return [pair for one in outcomes for pair in one["pairs"] if pair["prior"] == prior and pair["usable"]]
+
+
+def errors(pairs: Sequence[Outcome]) -> str:
+    """Return the median and the largest rotation error."""
+    found = [pair["error_deg"] for pair in pairs]
+    return f"{np.median(found):.2f}° / {max(found):.1f}°"
+
+
+def width(pairs: Sequence[Outcome]) -> str:
+    """Return the median of the standard deviations of rotations."""
+    return f"{np.median([pair['sd_deg'] for pair in pairs]):.1f}°"
+
+
+def trust(pairs: Sequence[Outcome]) -> tuple[str, str]:
+    """Return how large squared errors are for their covariances, mean and largest, and how many pairs are right."""
+    squares = [pair["nees"] / 6.0 for pair in pairs]
+    right = [pair["error_deg"] <= max(RIGHT_DEG, _SIGMAS * pair["sd_deg"]) for pair in pairs]
+    return f"{np.mean(squares):.2f} / {max(squares):.1f}", f"{sum(right)} of {len(right)}"

@@ -251,7 +251,7 @@ class Capture(AbstractSequence):
                 image[own] = np.random.default_rng([self.seed, 4]).uniform(60.0, 230.0, 3)
             else:
                 repeats = 1.5 if kind == _OBJECT else 0.4
-                image[own] = _printed(self.pictures[drawn.pictures[kind]], repeats * places, directions)
+                image[own] = printed(self.pictures[drawn.pictures[kind]], repeats * places, directions)
         towards = np.where((normals * points_m).sum(axis=2, keepdims=True) > 0.0, -normals, normals)
         lamp = np.array([0.4, -0.7, -0.6]) / np.linalg.norm([0.4, -0.7, -0.6])
         shading = 0.5 + 0.5 * np.maximum(towards @ lamp, 0.0)
@@ -260,7 +260,7 @@ class Capture(AbstractSequence):
         return np.clip(noisy, 0.0, 255.0).astype(np.uint8)
 
 
-def _printed(picture: npt.NDArray[np.uint8], places: Array, directions: Array) -> Array:
+def printed(picture: npt.NDArray[np.uint8], places: Array, directions: Array) -> Array:
     """Return the colours (n, 3) of places (n, 3) on which a photograph lies from the side that they face (n, 3)."""
     side = np.abs(directions).argmax(axis=1)
     across = np.array([[1, 2], [0, 2], [0, 1]])[side]
