@@ -36,7 +36,7 @@ from modeler.system.processes import check_installed
 from modeler.types import Array, InputError, ObjectModel
 
 _MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}
-_PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, whose vertices carry the colours
+_PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, at most
 _DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
 _SIGMAS: Final = 3.0  # of depth, up to which a point is seen where it was measured
 _WITHIN_MASKS: Final = 0.9  # share of the initial points; some lie at the rim, or behind a hand

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from studies.colour.study import PARTS, SEEDS, cases, measured
-from studies.colour.tables import bodies, effects, text
-from studies.results.tables import FOLDER, record
+from studies.colour.tables import text
 from studies.results_file import earlier_results
 from studies.side_by_side import results
 
@@ -37,7 +36,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--parts", choices=PARTS, nargs="+", default=PARTS, help="what is measured")
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of captures")
     parser.add_argument("--things", type=Path, default=Path("things.npz"), help="file with photographs, for pairs")
-    parser.add_argument("--record", action="store_true", help="put the pairs into the results")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/colour"), help="folder of the results")
     options = parser.parse_args(arguments)
@@ -57,12 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             done[one["key"]] = one
             print(json.dumps(one), file=stream, flush=True)
             print(f"{len(done)}: {one['key']}, {one['seconds']} s", file=sys.stderr, flush=True)
-    outcomes = [done[case.key] for case in wanted]
-    print(text(outcomes))
-    if options.record:
-        pairs = [one for one in outcomes if one["part"] == "pairs"]
-        record(FOLDER / "colour_effects.json", effects(pairs))
-        record(FOLDER / "colour_bodies.json", bodies(pairs))
+    print(text([done[case.key] for case in wanted]))
     return 0
 
 
