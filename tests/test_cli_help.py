@@ -14,6 +14,7 @@ from command_runner import Run
 
 from modeler import priors
 from modeler.cli import main, parsed
+from modeler.cli.overview import SUMMARIES, command_class
 from modeler.composition.options import PriorOptions
 
 COMMANDS = (
@@ -39,6 +40,15 @@ def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tell
         assert "Build the model of an object from a sequence: register its frames, close loops, fuse." in text
     assert "Ctrl-C" in alone
     assert "Ctrl-C" not in overall
+
+
+def test_help_of_the_program_has_the_first_sentence_of_each_command_without_importing_it() -> None:
+    assert set(SUMMARIES) == set(COMMANDS)
+    for name, told in SUMMARIES.items():
+        assert " ".join((command_class(name).__doc__ or "").split("\n\n")[0].split()) == told
+    script = "import atexit, sys; atexit.register(lambda: print('tyro' in sys.modules)); import modeler.cli as cli; "
+    ended = subprocess.run([sys.executable, "-c", f"{script} cli.main(['--help'])"], capture_output=True, check=False)
+    assert ended.stdout.endswith(b"False\n")
 
 
 def test_help_may_be_asked_for_in_a_word(cli: Run) -> None:

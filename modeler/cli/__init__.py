@@ -23,51 +23,13 @@ from difflib import get_close_matches
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any, Protocol, Union
-
-import tyro
+from typing import Any
 
 from modeler.cli import messages
-from modeler.cli.batch import Batch
-from modeler.cli.build import Build
-from modeler.cli.calibrate import CalibrateCamera, CalibrateSensor
 from modeler.cli.console import INTERRUPTED, endable, say, worded_as_options
-from modeler.cli.convert import Convert, Render
-from modeler.cli.edit import Edit, Join
-from modeler.cli.evaluate import Evaluate
-from modeler.cli.export import Export
-from modeler.cli.info import Info
-from modeler.cli.pages import Gallery, Report, Studio, View
-from modeler.cli.register import Register
-from modeler.cli.suggest import Suggest
-from modeler.cli.track import Track
+from modeler.cli.overview import SUMMARIES, Command, command_class, overview
 from modeler.system.processes import check_room, share_one_heap
 
-
-class Command(Protocol):
-    """A frozen dataclass of options."""
-
-    def run(self) -> int:
-        """Return the exit status."""
-        ...
-
-
-_ALL: tuple[type[Command], ...] = (
-    *(Build, Batch, Info, Convert, CalibrateSensor, CalibrateCamera, Register, Evaluate, Render, View, Report),
-    *(Export, Track, Join, Edit, Suggest, Gallery, Studio),
-)
-COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
-"""By name, in the order in which help lists them."""
-_STYLE = (
-    tyro.conf.OmitSubcommandPrefixes,
-    tyro.conf.OmitArgPrefixes,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.DisallowNone,
-)
-_DESCRIPTION = (
-    "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr. "
-    f"--version prints the version. {messages.HELP}"
-)
 complain = partial(say, level=logging.ERROR)
 _ROOM = 7 * 2**27  # bytes of addresses that registering two frames takes, a third of them used
 _FILES = 256  # open at the same time: Rerun ends the process where it cannot open its own
@@ -144,39 +106,34 @@ def parsed(arguments: Sequence[str]) -> Command:
     """
     name, *others = messages.split(arguments)[1] or ("",)
     if name == "help":
-        name, others = (others[0], ["--help"]) if others[:1] and others[0] in COMMANDS else ("--help", [])
+        name, others = (others[0], ["--help"]) if others[:1] and others[0] in SUMMARIES else ("--help", [])
     if name == "--version":
         from importlib.metadata import version
 
         print(f"modeler {version('modeler')}")
         raise SystemExit(0)
     if name in ("-h", "--help"):
-        return tyro.cli(_overview(), prog="modeler", description=_DESCRIPTION, args=["--help"], config=_STYLE)
-    if name not in COMMANDS:
-        near = get_close_matches(name, COMMANDS, n=1)
+        print(overview(), end="")
+        raise SystemExit(0)
+    if name not in SUMMARIES:
+        near = get_close_matches(name, SUMMARIES, n=1)
         kind = "option" if name.startswith("-") else "command"
         wrong = f"unknown {kind} '{name}'" if name else "no command given"
-        hint = f"did you mean '{near[0]}'?" if near else f"the commands are {', '.join(COMMANDS)};"
+        hint = f"did you mean '{near[0]}'?" if near else f"the commands are {', '.join(SUMMARIES)};"
         complain(f"{wrong}; {hint} see modeler --help")
         raise SystemExit(2)
-    box = io.StringIO()
+    import tyro
+
+    command, conf, box = command_class(name), tyro.conf, io.StringIO()
+    style = conf.OmitSubcommandPrefixes, conf.OmitArgPrefixes, conf.FlagCreatePairsOff, conf.DisallowNone
     try:
         with contextlib.redirect_stderr(box):
-            told = f"{inspect.cleandoc(COMMANDS[name].__doc__ or '')}\n\n{messages.HELP}"
-            return tyro.cli(COMMANDS[name], prog=f"modeler {name}", description=told, args=others, config=_STYLE)
+            told = f"{inspect.cleandoc(command.__doc__ or '')}\n\n{messages.HELP}"
+            return tyro.cli(command, prog=f"modeler {name}", description=told, args=others, config=style)
     except SystemExit as ending:
         if ending.code:
             complain(f"{_one_line(box.getvalue())}; see modeler {name} --help")
         raise
-
-
-def _overview() -> Any:
-    """Return the type that is any of the commands, each described by its first sentence."""
-    commands = COMMANDS.items()
-    told = {name: (command.__doc__ or "").split("\n\n", maxsplit=1)[0] for name, command in commands}
-    return Union[  # noqa: UP007
-        tuple(Annotated[c, tyro.conf.subcommand(name, description=told[name])] for name, c in commands)
-    ]
 
 
 def _one_line(box: str) -> str:
@@ -207,6 +164,8 @@ def _run(command: Command) -> int:
     check_room(_ROOM)
     with endable():
         _import_numba()
+        from modeler.cli.pages import View
+
         importlib.import_module("modeler.viz.viewer" if isinstance(command, View) else "modeler.cli.reading")
         from modeler.types import InputError
     try:

@@ -51,16 +51,15 @@ def say(words: str, level: int = logging.INFO) -> None:
 
 def as_options(words: str) -> str:
     """Return a message with the parameters that it names in backticks, such as `max_depth_m`, as options."""
-    options = _options()
-    return re.sub(r"`(\w+)`", lambda found: options.get(found[1], found[0]), words)
+    return re.sub(r"`(\w+)`", lambda found: _options().get(found[1], found[0]), words)
 
 
 @cache
 def _options() -> dict[str, str]:
     """Return the options of all commands by the names of their parameters."""
-    from modeler.cli import COMMANDS
+    from modeler.cli.overview import SUMMARIES, command_class
 
-    groups, names = list[Any](COMMANDS.values()), set[str]()
+    groups, names = list[Any](map(command_class, SUMMARIES)), set[str]()
     while groups:
         for field in fields(groups.pop()):
             names.add(field.name)
