@@ -228,7 +228,7 @@ class _Search:
         tree, loops = ([_chosen(factor, of) for factor in some] for some in (tree, loops))
         optimum = optimise(tree, loops, chain(tree, root, {}), root=root, threshold=self.threshold)
         chosen = selected(loops, optimum.inlier)
-        evidence = -optimum.error - RelativeCovariance(optimum.poses, root, (*tree, *chosen)).log_determinant
+        evidence = -optimum.error - RelativeCovariance.of(optimum.poses, root, (*tree, *chosen)).log_determinant
         for edge, mode in hypothesis.items():
             chosen_mode = edge.posterior.modes[int(mode)]
             evidence += np.log(chosen_mode.weight) - 0.5 * np.linalg.slogdet(chosen_mode.pose.covariance)[1]

@@ -33,6 +33,8 @@ class _State:
     inlier: tuple[bool, ...] = ()
     """Whether each loop takes part."""
     solver: IncrementalSolver | None = None
+    covariance: RelativeCovariance | None = None
+    """Covariances for independent edges; None with an axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +109,15 @@ class Smoother:
             trajectory, inlier, solver = solve_loops(
                 tree, loops, start, root=root, threshold=self._threshold, before=before
             )
-        state = _State(root, factors, spanning, decided, weights, inlier, solver)
+        before = None if closes or mode_changed else self.state.covariance
+        covariance = None if before is None else before.plus(trajectory, tree[known:])
+        state = _State(root, factors, spanning, decided, weights, inlier, solver, covariance)
         if grew and decided and inlier.count(False) > self.state.inlier.count(False):
             # A false loop may have decided modes: all are selected anew.
             again = replace(self, state=_State()).to(graph)
             if len(again.solution.outliers) <= inlier.count(False):
                 return again
-        solution = self._solution(state, (tree, loops), trajectory)
+        state, solution = self._solution(state, (tree, loops), trajectory)
         return replace(self, graph=graph, solution=replace(solution, odometry=odometry), state=state)
 
     @property
@@ -126,11 +130,11 @@ class Smoother:
         state: _State,
         factors: tuple[Sequence[Factor], Sequence[Factor]],
         trajectory: Mapping[int, Array],
-    ) -> Solution:
-        """Return the solution without its odometry.
+    ) -> tuple[_State, Solution]:
+        """Return the intermediate results with covariances, and the solution without its odometry.
 
         Args:
-            state: intermediate results.
+            state: intermediate results; with covariances where these are known already.
             factors: tree and loops, with the modes that the loops select.
             trajectory: object_from_camera (4, 4) by frame number, without an axis.
         """
@@ -139,11 +143,14 @@ class Smoother:
         if self.axis is not None:
             inlier, with_axis = self._with_axis(self.axis, tree, loops, trajectory, state)
         trajectory = trajectory if with_axis is None else with_axis.poses
-        taking_part = [*tree, *selected(loops, inlier)]
-        axis_factors = () if with_axis is None else with_axis.factors
-        relative_covariance = self._covariance(RelativeCovariance(trajectory, root, taking_part, axis_factors))
+        independent = state.covariance
+        if independent is None or self.axis is not None:
+            taking_part, extra = [*tree, *selected(loops, inlier)], () if with_axis is None else with_axis.factors
+            independent = RelativeCovariance.of(trajectory, root, taking_part, extra)
+        relative_covariance = self._covariance(independent)
         several = [factor for factor in (*tree, *loops) if factor.modes]
-        return Solution(
+        state = replace(state, covariance=None if self.axis is not None else independent)
+        return state, Solution(
             trajectory=trajectory,
             covariances=PoseCovariances(trajectory, functools.partial(relative_covariance, root)),
             outliers=tuple(loop.edge for loop, good in zip(loops, inlier, strict=True) if not good),
