@@ -16,6 +16,7 @@ from modeler.graph import PoseGraph, Smoother, optimise, solve
 from modeler.types import Edge, Mode, PoseGaussian, Solution
 
 COUNT, PER_TURN = 40, 12
+TAIL = 40  # frames of one edge each, so many that all are eliminated anew
 
 
 def _arrivals(rng: np.random.Generator, *, false: float = 0.0, modes: bool = False) -> list[list[Edge]]:
@@ -138,11 +139,11 @@ def _tail(count: int, rng: np.random.Generator) -> list[list[Edge]]:
 
 def test_frames_of_one_edge_have_the_covariances_of_the_batch() -> None:
     growing = Smoother()
-    for edges in [*_arrivals(np.random.default_rng(9)), *_tail(9, np.random.default_rng(10))]:
+    for edges in [*_arrivals(np.random.default_rng(9)), *_tail(TAIL, np.random.default_rng(10))]:
         growing = growing.plus(edges)
     batch, rng = solve(growing.graph, {}), np.random.default_rng(11)
-    assert set(growing.solution.covariances) == set(batch.covariances) == set(range(COUNT + 9))
-    pairs = [*itertools.pairwise(range(COUNT - 2, COUNT + 9)), *rng.permuted([range(COUNT + 9)] * 2, axis=1).T]
+    assert set(growing.solution.covariances) == set(batch.covariances) == set(range(COUNT + TAIL))
+    pairs = [*itertools.pairwise(range(COUNT - 2, COUNT + TAIL)), *rng.permuted([range(COUNT + TAIL)] * 2, axis=1).T]
     for target, source in pairs:
         if target != source:
             found, wanted = (s.relative_covariance(target, source) for s in (growing.solution, batch))

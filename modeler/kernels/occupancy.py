@@ -70,8 +70,8 @@ def minimal_surface(start, fixed, rounds):
     slopes = [np.zeros_like(start) for _ in range(3)]
     step = np.float32(1.0 / math.sqrt(12.0))  # τ σ ‖∇‖² <= 1, with ‖∇‖² <= 12 in three dimensions
     for _ in range(rounds):
-        over_rows(_ascend, np.arange(len(start) - 1), *slopes, ahead, step)
-        over_rows(_descend, np.arange(1, len(start) - 1), u, ahead, *slopes, fixed, step)
+        over_rows(_ascend, np.arange(len(start) - 1), *slopes, ahead, step, in_place=True)
+        over_rows(_descend, np.arange(1, len(start) - 1), u, ahead, *slopes, fixed, step, in_place=True)
     return u
 
 

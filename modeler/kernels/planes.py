@@ -217,7 +217,7 @@ def local_planes(depth_m, mask, silhouette, intrinsics, ball, sigma_inverse_per_
     images = depth_m, mask, silhouette, centres, points
     cells = np.empty((*depth_m.shape, CELL_SIZE), dtype=np.float32)
     apart = np.argsort(np.arange(len(cells)) % _APART, kind="stable")  # every thread gets its share of the object
-    over_rows(_local_planes, apart, cells, *images, window, intrinsics, ball, sigma_inverse_per_m)
+    over_rows(_local_planes, apart, cells, *images, window, intrinsics, ball, sigma_inverse_per_m, in_place=True)
     return cells
 
 

@@ -299,7 +299,7 @@ def integrate_view(sums, box, *view):
             (h, w) float32, 0 = unknown; points (n, 3) in the object frame, normals (n, 3) and weights (n,); colours
             (n, 4), RGB and 1, or 0 without colour.
     """
-    over_rows(_integrate_view, np.arange(box[1, 0] - box[0, 0]), sums, box, *view)
+    over_rows(_integrate_view, np.arange(box[1, 0] - box[0, 0]), sums, box, *view, in_place=True)
 
 
 @njit(cache=True, nogil=True)
