@@ -44,9 +44,6 @@ class AbstractSequence(ABC):
         """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known.
 
         Frames whose truth is not known are left out.
-
-        Raises:
-            InputError: if the ground truth cannot be read.
         """
         return None
 
@@ -114,9 +111,6 @@ class AbstractSequence(ABC):
         Args:
             every: stride over the frames.
             frames: keep frame numbers from `start` up to but not including `stop`.
-
-        Raises:
-            InputError: if nothing is left.
         """
         check_every(every)
         start, stop = (None, None) if frames is None else (frames.start, frames.stop)
@@ -138,72 +132,57 @@ class AbstractDerived(AbstractSequence):
 
     @property
     def name(self) -> str:
-        """Name of the sequence."""
         return self.whole.name
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending."""
         return self.whole.indices
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`."""
         return self.whole.frame(index)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4) by frame number; None if it is not known."""
         return self.whole.truth()
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of its camera; None if unknown."""
         return self.whole.sensor()
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """Known motion between consecutive frames of the underlying sequence."""
         return self.whole.motion
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """Files and folders that are read."""
         return self.whole.inputs
 
     @property
     def robot_path(self) -> Path | None:
-        """Trajectory of the robot hand that holds the object; None if there is none."""
         return self.whole.robot_path
 
     @property
     def model_path(self) -> Path | None:
-        """The true surface as a mesh in m; None if it is not known."""
         return self.whole.model_path
 
     @property
     def layout(self) -> str:
-        """Format of the sequence."""
         return self.whole.layout
 
     @property
     def depth_unit(self) -> str:
-        """Unit of stored depth."""
         return self.whole.depth_unit
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Assumptions and omissions of the reader."""
         return self.whole.notes
 
     @property
     def live(self) -> bool:
-        """Whether more frames arrive than `indices` lists."""
         return self.whole.live
 
     def recorded(self) -> AbstractSequence:
-        """Return the frames that have already arrived, as a sequence that ends."""
         return replace(self, whole=self.whole.recorded())
 
     def until(self, stop: Callable[[], bool]) -> AbstractSequence:
-        """Return the sequence, which, if live, ends as soon as `stop()` is true."""
         return replace(self, whole=self.whole.until(stop))
 
 
@@ -220,19 +199,13 @@ class AbstractLive(AbstractSequence):
 
     @property
     def live(self) -> bool:
-        """True: more frames come."""
         return True
 
     def until(self, stop: Callable[[], bool]) -> Self:
-        """Return the sequence that ends when it is asked to."""
         return replace(self, stop=stop)
 
     def select(self, every: int = 1, frames: slice | None = None) -> Self:
-        """Return a part of the sequence, of present and future frames.
-
-        Raises:
-            InputError: if `every` keeps nothing.
-        """
+        """Return a part of the sequence, of present and future frames."""
         check_every(every)
         return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
 
@@ -247,11 +220,9 @@ class SelectedSequence(AbstractDerived):
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending."""
         return self.kept
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`."""
         if index not in self.kept:
             raise InputError(
                 f"frame {index} is not among the selected frames ({span(self.kept)}); ask for one of those."
@@ -259,7 +230,6 @@ class SelectedSequence(AbstractDerived):
         return self.whole.frame(index)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4) by frame number; None if it is not known."""
         truth = self.whole.truth()
         return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
 
@@ -281,9 +251,6 @@ class GivenSequence(AbstractSequence):
         Args:
             frames: in order of time.
             live: take only the first frames, from which the scene is learned, and each other one when it is asked for.
-
-        Raises:
-            InputError: if there is none, one is no frame, or their numbers do not ascend.
         """
         coming = _checked(frames)
         given = tuple(itertools.islice(coming, FIRST if live else None))
@@ -293,21 +260,17 @@ class GivenSequence(AbstractSequence):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
         return "frames"
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Numbers of the frames that were given."""
         return tuple(frame.index for frame in self.given)
 
     @property
     def live(self) -> bool:
-        """Whether more frames come."""
         return self.coming is not None
 
     def frame(self, index: int) -> Frame:
-        """Return one of the frames that were given."""
         for frame in self.given:
             if frame.index == index:
                 return frame
@@ -345,7 +308,6 @@ class KeptSequence(AbstractDerived):
     """By frame number."""
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`."""
         found = self.kept.get(index)
         if found is None:
             found = self.whole.frame(index)
@@ -365,21 +327,13 @@ def _size_bytes(frame: Frame) -> int:
 
 
 def check_every(every: int) -> None:
-    """Check a stride.
-
-    Raises:
-        InputError: if it is less than 1.
-    """
+    """Check a stride."""
     if every < 1:
         raise InputError(f"`every` {every} keeps no frame; give a whole number of at least 1.")
 
 
 def frame_range(text: str) -> slice:
-    """Read a range of frame numbers `A:B`, half-open; either end may be left out.
-
-    Raises:
-        InputError: if the text is no such range.
-    """
+    """Read a range of frame numbers `A:B`, half-open; either end may be left out."""
     match = re.fullmatch(r"([0-9]{0,18}):([0-9]{0,18})", text.strip())
     if match is None:
         raise InputError(f"`frames` {text[:99]!r} is not a range of frame numbers; write A:B, for instance 0:14.")

@@ -98,11 +98,9 @@ class BopSequence(AbstractRecording):
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending: the frames that have a depth image."""
         return tuple(self._depth_paths)
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`, depth in m and NaN where nothing was measured."""
         if index not in self._depth_paths:
             raise self.absent(index)
         path = self._depth_paths[index]
@@ -117,7 +115,6 @@ class BopSequence(AbstractRecording):
         return Frame(index, self._times_s[index], metres(raw, scale_mm), camera, mask, colour, occluder)
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4), in m, by frame number; None without `scene_gt.json`."""
         path = self.path / "scene_gt.json"
         if not is_there(path):
             return None
@@ -137,19 +134,16 @@ class BopSequence(AbstractRecording):
 
     @property
     def layout(self) -> str:
-        """Format of the sequence."""
         return "BOP scene folder"
 
     @property
     def depth_unit(self) -> str:
-        """Unit of stored depth."""
         scales = sorted({scale for _, scale in self._intrinsics.values()})
         source = "scene_camera.json" if self.overrides.depth_scale_mm is None else "`depth_scale_mm`"
         return f"{' or '.join(f'{scale:g}' for scale in scales[:3])} mm ({source})"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Omissions of the reader, and unusual values that it accepted."""
         notes = []
         left = [index for index in self._colour_paths if index not in self._depth_paths]
         if left:
@@ -308,9 +302,6 @@ def write_bop(
         depth_scale_mm: millimetres per unit of depth; with 0.1 depth reaches to 6.55 m.
         colour_suffix: `.png`, or `.jpg` for small files.
         files: more files by name, such as `model.ply` and `robot.txt`.
-
-    Raises:
-        InputError: if the folder is not empty or cannot be written, or depth does not fit into 16 bits.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

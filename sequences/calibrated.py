@@ -76,11 +76,7 @@ def slope_terms(distance_m: Array, angle_rad: Array) -> Array:
 
 
 def read_noise(path: Path) -> NoiseModel:
-    """Read a model that `modeler calibrate-sensor` has stored.
-
-    Raises:
-        InputError: if it is missing or says something else.
-    """
+    """Read a model that `modeler calibrate-sensor` has stored."""
     node = read_tree(path).need("noise")
     growth = node.need("growth").elements()
     if len(growth) != 3:
@@ -125,7 +121,6 @@ class CalibratedSequence(AbstractDerived):
         return known._replace(sigma_wh=sigma_wh, sigma_r_m=sigma_r_m)
 
     def select(self, every: int = 1, frames: slice | None = None) -> CalibratedSequence:
-        """Return a part of the sequence."""
         return replace(self, whole=self.whole.select(every, frames))
 
     def __iter__(self) -> Iterator[Frame]:
@@ -177,11 +172,7 @@ class FocalFactor:
 
 
 def read_focal_factor(path: Path) -> FocalFactor:
-    """Read a factor that `modeler calibrate-camera` has stored.
-
-    Raises:
-        InputError: if the file is missing or says something else.
-    """
+    """Read a factor that `modeler calibrate-camera` has stored."""
     node = read_tree(path)
     return FocalFactor(
         node.need("focal_factor").number(0.5, 2.0),
@@ -208,18 +199,12 @@ class RefocusedSequence(AbstractDerived):
         return (SensorNoise(sigma_r_m=None) if noise is None else noise)._replace(sigma_focal=self.focal.factor_sigma)
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`.
-
-        Raises:
-            InputError: if its camera is not the one that the focal length is of.
-        """
         return self._refocused(self.whole.frame(index))
 
     def __iter__(self) -> Iterator[Frame]:
         return map(self._refocused, self.whole)
 
     def select(self, every: int = 1, frames: slice | None = None) -> RefocusedSequence:
-        """Return a part of the sequence."""
         return replace(self, whole=self.whole.select(every, frames))
 
     def _refocused(self, frame: Frame) -> Frame:
@@ -245,13 +230,11 @@ class AxialSequence(AbstractDerived):
     """Another sequence, whose depth is the distance along the ray, with depth along the optical axis."""
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`."""
         frame = self.whole.frame(index)
         return replace(frame, depth_m=(frame.depth_m / stretch(frame.camera)).astype(np.float32))
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Assumptions and omissions of the reader."""
         return (*self.whole.notes, "depth is taken for the distance along the ray (`along_ray`)")
 
 

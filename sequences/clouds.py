@@ -52,7 +52,6 @@ class CloudSequence(AbstractRecording):
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending."""
         return tuple(self.clouds)
 
     def frame(self, index: int) -> Frame:
@@ -85,13 +84,11 @@ class CloudSequence(AbstractRecording):
 
     @property
     def layout(self) -> str:
-        """Format of the sequence."""
         kinds = sorted({path.suffix.lower()[1:].upper() for path in self.clouds.values()})
         return f"{'organised clouds' if self.is_organised else 'clouds'} ({', '.join(kinds)})"
 
     @property
     def depth_unit(self) -> str:
-        """Unit of the coordinates."""
         return f"{'m' if self.unit_mm == 1000.0 else f'{self.unit_mm:g} mm'} ({self.unit_source})"
 
 

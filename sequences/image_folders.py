@@ -138,11 +138,9 @@ class ImageFolderSequence(AbstractRecording):
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending."""
         return tuple(self.files)
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`, depth in m and NaN where nothing was measured."""
         files = self.files.get(index)
         if files is None:
             raise self.absent(index)
@@ -185,22 +183,18 @@ class ImageFolderSequence(AbstractRecording):
         return self.camera.lens(depth_size(self._first))
 
     def truth(self) -> dict[int, Array] | None:
-        """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known."""
         return self.read_truth()
 
     @property
     def layout(self) -> str:
-        """Format of the sequence."""
         return self.what
 
     @property
     def depth_unit(self) -> str:
-        """Unit of stored depth."""
         return f"{self.depth_scale_mm:g} mm ({self.unit_source})"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Assumptions and omissions of the reader."""
         said = list(self.remarks)
         coloured = next((files for files in self.files.values() if files.colour is not None), None)
         if coloured is not None and coloured.colour is not None:

@@ -111,14 +111,12 @@ class KinectSequence(AbstractStreams[int]):
     """Millimetres per unit of depth."""
 
     def seen_m(self, index: int, stamp: int) -> npt.NDArray[np.float32]:
-        """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
         camera, data = self.lens.camera, self.file.packet("DEPTH", stamp)
         if len(data) != 2 * camera.width * camera.height:
             raise InputError(f"{self.path}: depth image {index} is cut off; record it again.")
         return metres(np.frombuffer(data, ">u2").reshape(camera.height, camera.width).astype(np.uint16), self.unit_mm)
 
     def colour_at(self, index: int, stamp: int, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
-        """Return colour (h, w, 3) as RGB at the pixels of depth; None without a colour camera."""
         if self.alignment is None:
             return None
         image = self.file.image("COLOR", stamp, f"{self.path}: colour image {index}")
@@ -132,12 +130,10 @@ class KinectSequence(AbstractStreams[int]):
 
     @property
     def layout(self) -> str:
-        """Format of the sequence."""
         return "Azure Kinect recording (MKV)"
 
     @property
     def depth_unit(self) -> str:
-        """Unit of stored depth."""
         return f"{self.unit_mm:g} mm ({'of the format' if self.unit_mm == 1.0 else '`depth_scale_mm`'})"
 
 

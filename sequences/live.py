@@ -86,20 +86,16 @@ class LiveSequence(AbstractLive):
 
     @property
     def name(self) -> str:
-        """Name of the camera."""
         return self.camera.name
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Numbers of the first frames."""
         return tuple(frame.index for frame in self.seen)
 
     def recorded(self) -> AbstractSequence:
-        """Return the sequence of the first frames alone."""
         return replace(self, stop=lambda: True)
 
     def frame(self, index: int) -> Frame:
-        """Return one of the first frames."""
         for frame in self.seen:
             if frame.index == index:
                 return frame
@@ -113,12 +109,10 @@ class LiveSequence(AbstractLive):
 
     @property
     def layout(self) -> str:
-        """Source of the sequence."""
         return "live camera"
 
     @property
     def depth_unit(self) -> str:
-        """Unit of depth."""
         return f"{self.camera.unit_mm:g} mm (the camera)"
 
     def _coming(self) -> Iterator[Frame]:

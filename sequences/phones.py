@@ -38,7 +38,6 @@ class Record3DSequence(AbstractRecording):
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending."""
         return tuple(range(len(self.times_s)))
 
     def frame(self, index: int) -> Frame:
@@ -59,12 +58,10 @@ class Record3DSequence(AbstractRecording):
 
     @property
     def layout(self) -> str:
-        """Format of the sequence."""
         return "Record3D recording (R3D)"
 
     @property
     def depth_unit(self) -> str:
-        """Unit of stored depth."""
         return "1000 mm (of the format)"
 
     def _unpacked(self, name: str, size: tuple[int, int], kind: str) -> np.ndarray[Any, Any]:

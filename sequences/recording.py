@@ -48,7 +48,6 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Assumptions and omissions of the reader."""
         return self.remarks
 
     @property
@@ -60,7 +59,6 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The folder or the file."""
         return (self.path,)
 
     def sensor(self) -> SensorNoise | None:
@@ -86,7 +84,6 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """The motion in `sequence.json`; None if not given."""
         node = None if self._meta is None else self._meta.get("motion")
         return None if node is None else _motion(node)
 
@@ -196,7 +193,6 @@ class AbstractStreams(AbstractRecording, Generic[Stamp]):
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers, ascending."""
         return tuple(self.pairs)
 
     def frame(self, index: int) -> Frame:

@@ -56,12 +56,10 @@ class WatchedSequence(AbstractLive, AbstractDerived):
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Numbers of the frames that have arrived."""
         wanted = [index for index in self.whole.indices if self._wants(index)]
         return tuple(wanted[:: self.every])
 
     def recorded(self) -> AbstractSequence:
-        """Return the frames that existed when it was opened."""
         return self.whole
 
     def __iter__(self) -> Iterator[Frame]:
@@ -78,7 +76,6 @@ class WatchedSequence(AbstractLive, AbstractDerived):
 
     @property
     def layout(self) -> str:
-        """What the sequence is stored as."""
         return f"{self.whole.layout}, being written"
 
     def _wants(self, index: int) -> bool:

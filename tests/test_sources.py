@@ -73,3 +73,24 @@ def test_comparisons_of_arrays_are_found() -> None:
     held = "@dataclass(frozen=True)\nclass Held:\n    poses: Mapping[int, Array]\n"
     assert [name for name, _ in comparing(ast.parse(held))] == ["Held"]
     assert not list(comparing(ast.parse(held.replace("frozen=True", "frozen=True, eq=False"))))
+
+
+def test_public_methods_have_a_docstring_or_override_one_that_has() -> None:
+    classes = {node.name: node for path in SOURCES for node in tree(path).body if isinstance(node, ast.ClassDef)}
+
+    def documented(name: str) -> set[str]:
+        """Return the methods that a class, or one it derives from, documents."""
+        if name not in classes:
+            return set()
+        methods = [each for each in classes[name].body if isinstance(each, ast.FunctionDef)]
+        own = {each.name for each in methods if ast.get_docstring(each)}
+        bases = (re.split(r"[.\[]", ast.unparse(base)) for base in classes[name].bases)
+        return own.union(*(documented(part) for parts in bases for part in parts))
+
+    assert [
+        f"{name}.{method.name}"
+        for name in classes
+        for method in classes[name].body
+        if isinstance(method, ast.FunctionDef) and not (name + method.name).startswith("_")
+        if not method.name.startswith("_") and method.name not in documented(name)
+    ] == []

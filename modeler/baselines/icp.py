@@ -51,7 +51,6 @@ class IcpRegistrar(AbstractMultiscaleRegistrar):
     """
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum from the initial pose."""
         return self.refine(Cloud.of(source), Cloud.of(target), initial)
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
@@ -156,7 +155,6 @@ class GicpRegistrar(AbstractMultiscaleRegistrar):
     """Number of points from which the covariance of a neighbourhood is estimated."""
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum from the initial pose."""
         import small_gicp  # slow to load, and only needed here
 
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
@@ -213,11 +211,6 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
     """Largest number of points, itself included, for the gradient of intensity, within twice the reach."""
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum from the initial pose.
-
-        Raises:
-            InputError: if a view has no colour.
-        """
         clouds = Cloud.coloured(source), Cloud.coloured(target)
         return by_levels(clouds, initial, voxels=self.voxels, min_points=self.min_points, level=self.level)
 

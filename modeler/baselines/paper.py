@@ -62,7 +62,6 @@ class PaperRegistrar(AbstractRegistrar):
     """Device that draws, tests and weights samples."""
 
     def posterior_of(self, pair: ViewPair) -> Posterior:
-        """Return the posterior of target_from_source; its outcome states failure."""
         started = time.perf_counter()
         source, target, density, rng = pair.source, pair.target, pair.density, pair.rng
         if min(len(source.points_m), len(target.points_m)) < 10:

@@ -167,11 +167,7 @@ def write_note(path: Path, note: dict[str, Any]) -> None:
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open the log of a sequence for appending; what is no regular file there, as a link, is replaced.
-
-    Raises:
-        OSError: if it cannot be opened.
-    """
+    """Open the log of a sequence for appending; what is no regular file there, as a link, is replaced."""
     with suppress(FileNotFoundError):
         if not stat.S_ISREG(os.lstat(path).st_mode):
             path.unlink()
@@ -275,11 +271,7 @@ def run(job: Job) -> Ended | None:
 
 
 def write_failure(job: Job, line: str, status: int = 2) -> Ended:
-    """Record a (further) failure of a job, and return how it ended.
-
-    Raises:
-        OSError: if the note cannot be written.
-    """
+    """Record a (further) failure of a job, and return how it ended."""
     job.note.parent.mkdir(parents=True, exist_ok=True)
     note = read_note(job.note)
     tries = note.get("tries", 0) + 1

@@ -20,11 +20,7 @@ THUMBNAIL_PX = 160
 
 
 def record_of(run: Path) -> dict[str, Any]:
-    """Return the report, the size of the model and, if known, the errors of a finished run, as JSON values.
-
-    Raises:
-        InputError: if the folder holds no run.
-    """
+    """Return the report, the size of the model and, if known, the errors of a finished run, as JSON values."""
     folder = RunFolder(run)
     report = folder.result()
     record = report_columns(report) | {"sequence": str(folder.located(report["sequence"]))}

@@ -24,7 +24,6 @@ class ObservedSequence(AbstractDerived):
     """Called after each frame."""
 
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`."""
         frame = self.whole.frame(index)
         self.on_read()
         return frame

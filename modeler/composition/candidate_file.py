@@ -96,11 +96,7 @@ class Pose:
 
 
 def read_candidates(path: Path) -> list[Candidate]:
-    """Return the actions in a file.
-
-    Raises:
-        InputError: if it cannot be read or holds none.
-    """
+    """Return the actions in a file."""
     if path.suffix.lower() == ".csv":
         found = _poses(path)
     else:

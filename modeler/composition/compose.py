@@ -66,11 +66,7 @@ _GUESSES = ("velocity", "features")
 def modeler(
     sequence: AbstractSequence, prior_options: PriorOptions, method: MethodOptions, where: ObjectOptions
 ) -> Modeler:
-    """Return the loop with the parts asked for, its sensor as the sequence describes it, else of unknown noise.
-
-    Raises:
-        InputError: if an option cannot be used.
-    """
+    """Return the loop with the parts asked for, its sensor as the sequence describes it, else of unknown noise."""
     check_region(where, sequence)
     noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
     sensor = Sensor(SensorNoise(sigma_r_m=None, sigma_focal=NOMINAL_FOCAL) if noise is None else noise)
@@ -87,11 +83,7 @@ def modeler(
 
 
 def check_region(where: ObjectOptions, sequence: AbstractSequence) -> None:
-    """Refuse a region that is not part of the image.
-
-    Raises:
-        InputError: if some of it lies outside the first frame.
-    """
+    """Refuse a region that is not part of the image."""
     if where.roi is None:
         return
     camera = sequence.frame(sequence.indices[0]).camera
@@ -121,11 +113,7 @@ def scene(modeler: Modeler, sequence: AbstractSequence, frames: Sequence[int] = 
 def registrar(
     method: Method, *, colour: bool = True, device: Literal["cpu", "cuda"] | None = None
 ) -> AbstractRegistrar:
-    """Return the registration method of a name.
-
-    Raises:
-        InputError: if it cannot be there, or is not installed.
-    """
+    """Return the registration method of a name."""
     if device == "cuda":
         if method != "paper":
             raise InputError(f"`device` cuda: `method` {method} runs on the CPU only; leave `device` out")
@@ -158,9 +146,6 @@ def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> Ab
     Args:
         options: as given.
         sequence: to which it applies; None: several.
-
-    Raises:
-        InputError: if there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
     """
     name = prior_name(options, sequence)
     parts = name.split("+")

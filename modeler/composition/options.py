@@ -109,11 +109,7 @@ class PriorOptions:
     """Standard deviation of the change of shift from one motion to the next, along each axis (velocity)."""
 
     def given(self, name: str, accepted: Collection[str], of: Mapping[str, Collection[str]]) -> dict[str, Any]:
-        """Return the parameters that were given, by field name.
-
-        Raises:
-            InputError: if a parameter of another prior was given, or a value that is none.
-        """
+        """Return the parameters that were given, by field name."""
         from modeler.priors.checks import ParameterError, check_parameter
         from modeler.types import InputError
 

@@ -36,9 +36,6 @@ def write_bop(model: ObjectModel, out: Path, place: Placement, more: Mapping[str
         out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
         place: the frame to write it in; BOP's own has the origin in the centre of the box and z up.
         more: further values of the entry.
-
-    Raises:
-        InputError: if the name is not that of a PLY file, or a file cannot be read or written.
     """
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: BOP models are PLY files; choose a name such as obj_000001.ply")

@@ -75,11 +75,7 @@ def fits(row: Mapping[str, Any]) -> bool:
 
 
 def read_table(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a table.
-
-    Raises:
-        InputError: if there is none, or it has not these columns.
-    """
+    """Return the rows of a table."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -73,32 +73,20 @@ class Pairs:
         return self.folder.is_dir() and not self.folder.is_symlink()
 
     def mark(self) -> None:
-        """Make the folder.
-
-        Raises:
-            OSError: if that cannot be.
-        """
+        """Make the folder."""
         for folder in (self.folder, self._done):
             if folder.is_symlink():
                 folder.unlink()
         self.folder.mkdir(exist_ok=True)
 
     def empty(self) -> None:
-        """Forget everything; the folder stays.
-
-        Raises:
-            OSError: if that cannot be.
-        """
+        """Forget everything; the folder stays."""
         shutil.rmtree(self._done, ignore_errors=True)
         for file in self.folder.iterdir():
             file.unlink()
 
     def complete(self) -> None:
-        """Move everything to what is of complete runs; the folder goes.
-
-        Raises:
-            OSError: if that cannot be.
-        """
+        """Move everything to what is of complete runs; the folder goes."""
         if self.marked:
             for file in self.folder.iterdir():
                 self._done.mkdir(exist_ok=True)
@@ -128,7 +116,6 @@ class PairCache(AbstractPairCache):
     """Of the packages, with others of which results may be others."""
 
     def posterior_of(self, registrar: AbstractRegistrar, pair: ViewPair) -> Posterior:
-        """Return the stored result of the same registration, or else register and store it."""
         near = None if pair.near is None else pair.near.tobytes().hex()
         inputs = (registrar, sorted(self.versions.items()), pair.rng.bit_generator.state, pair.effort, near)
         key = _of_views(inputs, (pair.source, pair.target)), _of_prior(pair.density)

@@ -74,11 +74,7 @@ class Modeler:
     """Registrations of an interrupted run, if any."""
 
     def __post_init__(self) -> None:
-        """Reject a seed that random generators do not take.
-
-        Raises:
-            InputError: if it is negative.
-        """
+        """Reject a seed that random generators do not take."""
         if self.seed < 0:
             raise InputError(f"the seed {self.seed} is negative; give a whole number from 0")
 

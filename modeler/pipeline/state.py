@@ -80,19 +80,11 @@ class State:
         return 1 if other is None else abs(self.places[frame] - self.places[other])
 
     def read(self, prepared: Prepared) -> State:
-        """Return the state after reading one more frame.
-
-        Raises:
-            InputError: if its number is that of an earlier one.
-        """
+        """Return the state after reading one more frame."""
         return replace(self, places={**self.places, self._new(prepared): len(self.places)})
 
     def inserted(self, prepared: Prepared) -> State:
-        """Return the state after reading a frame that was skipped: its number decides its place among the others.
-
-        Raises:
-            InputError: if its number is that of an earlier one.
-        """
+        """Return the state after reading a frame that was skipped: its number decides its place among the others."""
         frames = sorted([*self.places, self._new(prepared)])
         return replace(self, places={frame: place for place, frame in enumerate(frames)})
 

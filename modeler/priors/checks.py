@@ -68,21 +68,13 @@ def check_parameter(name: str, value: object, *, exact: bool = True) -> None:
 
 
 def check_parameters(component: Any) -> None:
-    """Check the fields of a dataclass by the units in their names, to be called in `__post_init__`.
-
-    Raises:
-        ParameterError: if one is not finite, or out of range.
-    """
+    """Check the fields of a dataclass by the units in their names, to be called in `__post_init__`."""
     for field in fields(component):
         check_parameter(field.name, getattr(component, field.name))
 
 
 def check_covariance(name: str, covariance: Array) -> None:
-    """Check that a covariance (n, n) is finite, symmetric and positive definite.
-
-    Raises:
-        InputError: if it is not.
-    """
+    """Check that a covariance (n, n) is finite, symmetric and positive definite."""
     valid = np.isfinite(covariance).all() and np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0)
     if not valid or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise InputError(f"{name} is not a covariance; give a finite, symmetric, positive definite matrix")

@@ -37,17 +37,14 @@ class GeneralPrior(AbstractPrior):
         check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
-        """Return the density of target_from_source."""
         offset_m = offset_limit_m(self.max_offset_m, self.steps, source, target)
         return GeneralDensity(source.centroid_m, target.centroid_m, np.deg2rad(self.max_rotation_deg), offset_m)
 
     def relaxed(self, steps: float) -> GeneralPrior:
-        """Return the prior with limits for several steps."""
         rotation_deg = relaxed_rotation_deg(self.max_rotation_deg, steps)
         return replace(self, max_rotation_deg=rotation_deg, steps=steps * self.steps)
 
     def unlimited(self) -> AnyMotion | None:
-        """Return the prior of any motion if the limits are defaults, else None."""
         return AnyMotion() if self.limits_assumed else None
 
 
@@ -66,7 +63,6 @@ class AnyMotion(AbstractPrior):
         check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> GeneralDensity:
-        """Return the density of target_from_source."""
         return GeneralDensity(source.centroid_m, target.centroid_m, np.pi, self.reach_m(source, target))
 
     def reach_m(self, source: RayImage, target: RayImage) -> float:
@@ -91,7 +87,6 @@ class GeneralDensity(AbstractPoseDensity):
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         angle = sample_angles(self.max_rotation_rad, count, rng)
         offset_m = directions(count, rng) * self.max_offset_m * rng.random((count, 1)) ** (1 / 3)
         motion = se3.exp(np.concatenate([angle[:, None] * directions(count, rng), np.zeros((count, 3))], axis=1))
@@ -100,7 +95,6 @@ class GeneralDensity(AbstractPoseDensity):
         return motion
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4); -inf outside."""
         trace = np.einsum("nij,ij->n", target_from_source[:, :3, :3], self.middle)  # of the rotation from the middle
         offset_m = centroid_offset(target_from_source, self.source_centroid_m, self.target_centroid_m)
         inside = (trace >= 1.0 + 2.0 * np.cos(self.max_rotation_rad) - 1e-9) & (

@@ -54,11 +54,6 @@ class HeldPrior(AbstractPrior):
             raise ParameterError("regrasp_probability", self.regrasp_probability, "a probability below 1")
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source.
-
-        Raises:
-            InputError: if the hand's pose at one of the views is unknown.
-        """
         hand_at_source, error_at_source = self.hand.at(source.frame)
         hand_at_target, error_at_target = self.hand.at(target.frame)
         motion = hand_at_target @ se3.inverse(hand_at_source)
@@ -87,12 +82,10 @@ class HeldPrior(AbstractPrior):
         return replace(self, regrasped=self.regrasped.relaxed(steps), steps=steps * self.steps)
 
     def unlimited(self) -> HeldPrior | None:
-        """Return the prior without limits on the motion in a regrasp, if these are defaults, else None."""
         regrasped = self.regrasped.unlimited()
         return None if regrasped is None else replace(self, regrasped=regrasped)
 
     def following(self, frame: int) -> HeldPrior:
-        """Return the prior for a frame placed relative to another."""
         return replace(self, previous=frame)
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> HeldPrior:

@@ -64,7 +64,6 @@ class Gaussian(AbstractPoseDensity):
         check_covariance("the covariance of a Gaussian", self.covariance)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         deviation = rng.normal(size=(count, 6)) @ self._root.T
         poses = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
         turn = se3.exp(np.concatenate([deviation[:, :3], np.zeros((count, 3))], axis=1))
@@ -73,7 +72,6 @@ class Gaussian(AbstractPoseDensity):
         return poses
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4)."""
         deviation = self.deviations(target_from_source)
         whitened = np.asarray(np.linalg.solve(self._root, deviation.T), dtype=np.float64)
         half_rad = 0.5 * np.sqrt(np.sum(deviation[:, :3] ** 2, axis=1))
@@ -142,7 +140,6 @@ class KernelMixture(AbstractPoseDensity):
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         middles = self.means[rng.choice(len(self.weights), count, p=self.weights)]
         angles, cumulative = self._angles
         angle_rad = np.interp(rng.random(count), cumulative, angles)
@@ -154,7 +151,6 @@ class KernelMixture(AbstractPoseDensity):
         return poses
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4)."""
         rotations, places_m = self._flat(target_from_source)
         middle_rotations, middle_places_m = self._flat(self.means)
         # 2 (cos θ - 1) = trace(R_middleᵀ R) - 3, and the trace is a sum over elements.
@@ -208,7 +204,6 @@ class Alternatives(AbstractPoseDensity):
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         chosen = rng.choice(len(self.densities), count, p=self.probabilities)
         poses = np.empty((count, 4, 4))
         for number, density in enumerate(self.densities):
@@ -216,14 +211,12 @@ class Alternatives(AbstractPoseDensity):
         return poses
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4); -inf outside all supports."""
         logs = [density.log_density(target_from_source) for density in self.densities]
         weighted = np.stack(logs) + np.log(self.probabilities)[:, None]
         return np.asarray(np.logaddexp.reduce(weighted, axis=0), dtype=np.float64)
 
     @property
     def alternatives(self) -> tuple[AbstractPoseDensity, ...]:
-        """The densities of which one is true."""
         return self.densities
 
 
@@ -246,7 +239,6 @@ class DefensiveMixture(AbstractPoseDensity):
     evidence: bool = False
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         part = rng.integers(len(self.proposals), size=count)
         part[rng.random(count) >= self.share] = -1
         poses = np.empty((count, 4, 4))
@@ -274,7 +266,6 @@ class DefensiveMixture(AbstractPoseDensity):
         return total
 
     def log_prior(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of the independent knowledge at poses (n, 4, 4)."""
         return self.known.log_prior(target_from_source)
 
 

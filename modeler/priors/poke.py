@@ -65,11 +65,7 @@ class PokePrior(AbstractPrior):
         check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; after several pushes that of the table prior.
-
-        Raises:
-            InputError: if neither view shows a plane, no push is given, or it is directed into the plane.
-        """
+        """Return the density of target_from_source; after several pushes that of the table prior."""
         earlier, later = sorted((source, target), key=lambda view: view.index)
         pokes = self._between(earlier.index, later.index)
         if len(pokes) > 1:
@@ -95,11 +91,7 @@ class PokePrior(AbstractPrior):
         return PokeDensity(plane, mean, covariance, backwards=source is later)
 
     def _between(self, earlier: int, later: int) -> list[Poke]:
-        """Return the pushes between two frames.
-
-        Raises:
-            InputError: if there is none.
-        """
+        """Return the pushes between two frames."""
         if not self.pokes and self.poke is not None:
             return [self.poke]
         found = [poke for frame, poke in self.pokes.items() if earlier < frame <= later]
@@ -149,13 +141,11 @@ class PokeDensity(AbstractPoseDensity):
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         drawn = self.mean + rng.normal(size=(count, 3)) @ np.linalg.cholesky(self.covariance).T
         later_from_earlier = self.plane.motions(drawn[:, 0], drawn[:, 1:], rng)
         return se3.inverse(later_from_earlier) if self.backwards else later_from_earlier
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4)."""
         # The uniform measure is the same forward and backward.
         later_from_earlier = se3.inverse(target_from_source) if self.backwards else target_from_source
         turn_rad, shift_m, out_of_plane = self.plane.coordinates(later_from_earlier)

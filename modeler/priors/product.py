@@ -43,11 +43,6 @@ class ProductPrior(AbstractPrior):
     """The other."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source.
-
-        Raises:
-            InputError: if one of the two does not apply, or they contradict each other.
-        """
         product = multiplied(self.first.between(source, target), self.second.between(source, target), source.centroid_m)
         if product is None:
             raise InputError(
@@ -57,23 +52,18 @@ class ProductPrior(AbstractPrior):
         return product
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> ProductPrior:
-        """Return the product of both updated priors."""
         return replace(self, first=self.first.learned(solution, edges), second=self.second.learned(solution, edges))
 
     def following(self, frame: int) -> ProductPrior:
-        """Return the product of both priors for a frame placed relative to another."""
         return replace(self, first=self.first.following(frame), second=self.second.following(frame))
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
-        """Return the axis that all steps share, if either part has one."""
         return self.first.shared_axis(views) or self.second.shared_axis(views)
 
     def relaxed(self, steps: float) -> ProductPrior:
-        """Return the product with limits for several steps."""
         return replace(self, first=self.first.relaxed(steps), second=self.second.relaxed(steps))
 
     def unlimited(self) -> ProductPrior | None:
-        """Return the product without the limits that are defaults, None if neither part has any."""
         first, second = self.first.unlimited(), self.second.unlimited()
         if first is None and second is None:
             return None
@@ -104,7 +94,6 @@ class Product(AbstractPoseDensity):
         return drawn[rng.permutation(resampled(np.exp(log_weights - log_weights.max()), count, rng))]
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4); -inf outside."""
         return (
             self.first.log_density(target_from_source) + self.second.log_density(target_from_source) - self.log_volume
         )
@@ -186,7 +175,6 @@ class AutoPrior(AbstractPrior):
     """Prior of an object that stays on the table."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source."""
         free = self.free.between(source, target)
         if support(source, target) is None:
             return free
@@ -195,10 +183,8 @@ class AutoPrior(AbstractPrior):
         return Alternatives((on_table, free), np.array([0.5, 0.5]))
 
     def relaxed(self, steps: float) -> AutoPrior:
-        """Return the prior with limits for several steps."""
         return replace(self, free=self.free.relaxed(steps), table=self.table.relaxed(steps))
 
     def unlimited(self) -> AutoPrior | None:
-        """Return the prior without limits on the motion, if these are defaults, else None."""
         free, table = self.free.unlimited(), self.table.unlimited()
         return None if free is None or table is None else replace(self, free=free, table=table)

@@ -38,11 +38,7 @@ class AbstractProposal(AbstractPrior):
     """The independent knowledge."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; the independent knowledge alone if there is no proposal.
-
-        Raises:
-            InputError: if the views lack what `known` needs.
-        """
+        """Return the density of target_from_source; the independent knowledge alone if there is no proposal."""
         known = self.known.between(source, target)
         proposal = self.proposal(source, target, known)
         return known if proposal is None else defensive_mixture(known, [proposal])
@@ -58,19 +54,15 @@ class AbstractProposal(AbstractPrior):
         """
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> AbstractPrior:
-        """Return the prior with its independent part updated."""
         return replace(self, known=self.known.learned(solution, edges))
 
     def following(self, frame: int) -> AbstractPrior:
-        """Return the prior for a frame placed relative to another."""
         return replace(self, known=self.known.following(frame))
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:
-        """Return the axis that all steps share, according to the independent knowledge."""
         return self.known.shared_axis(views)
 
     def relaxed(self, steps: float) -> AbstractPrior:
-        """Return the prior with limits for several steps."""
         return replace(self, known=self.known.relaxed(steps))
 
     def unlimited(self) -> AbstractPrior | None:
@@ -89,11 +81,6 @@ class PredictedProposal(AbstractPrior):
     """target_from_source of the pair."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source.
-
-        Raises:
-            InputError: if the views lack what the prior needs.
-        """
         covariance = se3.covariance_about(self.expected.covariance, source.centroid_m)
         sigma_rad, sigma_m = (
             float(np.sqrt(np.linalg.eigvalsh(c)[-1])) for c in (covariance[:3, :3], covariance[3:, 3:])
@@ -109,7 +96,6 @@ class PredictedProposal(AbstractPrior):
         return defensive_mixture(self.known.between(source, target), [guess])
 
     def relaxed(self, steps: float) -> PredictedProposal:
-        """Return the prior with limits for several steps."""
         return replace(self, known=self.known.relaxed(steps))
 
 
@@ -130,7 +116,6 @@ class VelocityPrior(AbstractProposal):
         check_parameters(self)
 
     def proposal(self, source: RayImage, target: RayImage, known: AbstractPoseDensity) -> KernelMixture | None:
-        """Return the prediction; None until two frames define a velocity."""
         poses = dict(self.trajectory)
         if len(poses) < 2 or target.index not in poses or source.index in poses:
             return None
@@ -150,7 +135,6 @@ class VelocityPrior(AbstractProposal):
         )
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> VelocityPrior:
-        """Return the prior with the poses so far."""
         trajectory = tuple(sorted(solution.trajectory.items(), key=lambda item: item[0]))
         return replace(self, known=self.known.learned(solution, edges), trajectory=trajectory)
 

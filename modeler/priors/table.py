@@ -150,11 +150,6 @@ class TablePrior(AbstractPrior):
         check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> TableDensity:
-        """Return the density of target_from_source.
-
-        Raises:
-            InputError: if neither view shows a support plane.
-        """
         limit_rad = float(np.radians(self.max_rotation_deg))
         shift_m = offset_limit_m(self.max_shift_m, self.steps, source, target)
         plane = on_plane(
@@ -168,7 +163,6 @@ class TablePrior(AbstractPrior):
         return TableDensity(plane, limit_rad, shift_m)
 
     def unlimited(self) -> AnyTurn | None:
-        """Return the prior of any turn and shift on the table if the limits are defaults, else None."""
         return AnyTurn(self.sigma_tilt_deg, self.sigma_height_m) if self.limits_assumed else None
 
     def relaxed(self, steps: float) -> TablePrior:
@@ -191,11 +185,6 @@ class AnyTurn(AbstractPrior):
         check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> TableDensity:
-        """Return the density of target_from_source.
-
-        Raises:
-            InputError: if neither view shows a support plane.
-        """
         shift_m = AnyMotion().reach_m(source, target)
         return TablePrior(180.0, shift_m, self.sigma_tilt_deg, self.sigma_height_m).between(source, target)
 
@@ -215,12 +204,10 @@ class TableDensity(AbstractPoseDensity):
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         turn_rad = self.middle_rad + rng.uniform(-self.max_rotation_rad, self.max_rotation_rad, count)
         return self.plane.motions(turn_rad, sample_disc(self.max_shift_m, count, rng), rng)
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4); -inf outside."""
         turn_rad, shift_m, out_of_plane = self.plane.coordinates(target_from_source)
         turn_rad = np.abs(np.remainder(turn_rad - self.middle_rad + np.pi, 2.0 * np.pi) - np.pi)
         inside = (turn_rad <= self.max_rotation_rad) & (np.sum(shift_m**2, axis=1) <= self.max_shift_m**2)

@@ -179,7 +179,6 @@ class AboutAxis(AbstractPoseDensity):
     evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         poses = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
         rotations = self.turn.sample(count, rng)
         poses[:, :3, :3] = rotations
@@ -197,7 +196,6 @@ class AboutAxis(AbstractPoseDensity):
         return poses
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of poses (n, 4, 4); -inf outside."""
         angle_rad, axes = angles_and_axes(target_from_source[:, :3, :3])
         lines, variance = self.turn.line(angle_rad, axes)
         rotation = self.turn.log_density(angle_rad, axes @ self.turn.axis)
@@ -296,11 +294,6 @@ class TurntablePrior(AbstractPrior):
         check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source.
-
-        Raises:
-            InputError: if a table is needed and neither view shows one.
-        """
         plane = support(source, target)
         if plane is None and self.needs_table:
             raise no_plane(source, target)
@@ -326,7 +319,6 @@ class TurntablePrior(AbstractPrior):
         return replace(self, learned_axis=learned_axis, sense=sense, previous=max(solution.trajectory, default=None))
 
     def following(self, frame: int) -> TurntablePrior:
-        """Return the prior for a frame placed relative to another."""
         return replace(self, previous=frame)
 
     def shared_axis(self, views: Collection[RayImage]) -> SharedAxis | None:

@@ -43,11 +43,7 @@ class Camera:
     """Row of the principal point in px."""
 
     def __post_init__(self) -> None:
-        """Reject a camera that has no pixels or no focal length.
-
-        Raises:
-            InputError: if it has none.
-        """
+        """Reject a camera that has no pixels or no focal length."""
         if not (self.width > 0 < self.height and self.fx > 0.0 < self.fy and np.isfinite(astuple(self)).all()):
             raise InputError(f"{self} is none; give a size in px, positive focal lengths and a principal point")
 
@@ -100,11 +96,7 @@ class Frame:
     """(h, w) True where a hand or a gripper is marked, which may hide the object; None = none is."""
 
     def __post_init__(self) -> None:
-        """Reject images of other shapes or types than the fields say: compiled functions read them unchecked.
-
-        Raises:
-            InputError: if an image is another.
-        """
+        """Reject images of other shapes or types than the fields say: compiled functions read them unchecked."""
         shape = (self.camera.height, self.camera.width)
         for name, image, expected, kind in (
             ("depth", self.depth_m, shape, "f"),

@@ -64,12 +64,10 @@ class RenderedSequence(AbstractSequence):
 
     @property
     def name(self) -> str:
-        """Name of the sequence."""
         return self.recipe.name
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Frame numbers from 0."""
         return tuple(range(len(self._camera_from_model)))
 
     def frame(self, index: int) -> Frame:
@@ -87,7 +85,6 @@ class RenderedSequence(AbstractSequence):
         return Frame(index, index * recipe.period_s, depth_m, camera, mask, colour)
 
     def truth(self) -> dict[int, Array]:
-        """Return the true camera_from_model (4, 4), in m, by frame number."""
         return dict(enumerate(self._camera_from_model))
 
     def sensor(self) -> SensorNoise:
@@ -99,7 +96,6 @@ class RenderedSequence(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, object] | None:
-        """The motion of the recipe."""
         return self.recipe.trajectory.motion()
 
     def model(self) -> Mesh:
@@ -223,11 +219,7 @@ class RenderedSequence(AbstractSequence):
 def render(
     recipe: Recipe, folder: Path, through: Callable[[AbstractSequence], AbstractSequence] = lambda sequence: sequence
 ) -> None:
-    """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`.
-
-    Raises:
-        InputError: if the folder is not empty or cannot be written.
-    """
+    """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`."""
     sequence = RenderedSequence(recipe)
     files = {"model.ply": ply_bytes(sequence.model())}
     readings = sequence.robot_readings()

@@ -174,14 +174,12 @@ class RosSequence(AbstractStreams[Stamp]):
     """The unit, for people."""
 
     def seen_m(self, index: int, stamp: Stamp) -> npt.NDArray[np.float32]:
-        """Return the depth (h, w) in m as the lens shows it, NaN where nothing was measured."""
         where = f"{self.path}: {self.depth_topic}, image {index}"
         depth_m = messages.depth_m(self.bag.message(self.depth_topic, stamp), self.unit_mm, where)
         self._check_size(where, depth_m.shape, self.lens)
         return depth_m
 
     def colour_at(self, index: int, stamp: Stamp, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8] | None:
-        """Return colour (h, w, 3) as RGB at the pixels of depth; None without a topic of colour."""
         if self.colour is None:
             return None
         where = f"{self.path}: {self.colour.topic}, for image {index}"
@@ -192,14 +190,12 @@ class RosSequence(AbstractStreams[Stamp]):
 
     @property
     def layout(self) -> str:
-        """Format of the sequence."""
         kinds = {".bag": "ROS 1 bag", ".mcap": "MCAP file", ".db3": "ROS 2 bag"}
         realsense = ", by RealSense" if self.depth_topic.startswith("/device_") else ""
         return f"{kinds.get(self.path.suffix.lower(), 'ROS 2 bag')}{realsense}, topic {self.depth_topic}"
 
     @property
     def depth_unit(self) -> str:
-        """Unit of stored depth."""
         return self.unit
 
     def _check_size(self, where: str, found: tuple[int, ...], lens: Lens) -> None:

@@ -101,15 +101,12 @@ class MixtureProposal(AbstractPoseDensity):
     evidence: bool = False
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw poses (count, 4, 4)."""
         return self.gaussians.sample(count, rng)
 
     def log_density(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of the proposal at poses (n, 4, 4)."""
         return self.gaussians.log_density(target_from_source) - self.gaussians.log_weight
 
     def log_prior(self, target_from_source: Array) -> Array:
-        """Return the log density (n,) of the prior at poses (n, 4, 4)."""
         return self.known.log_prior(target_from_source)
 
 
