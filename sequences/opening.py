@@ -21,8 +21,7 @@ from modeler.sequences.image_folders import (
 )
 from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
-from modeler.sequences.live import SCHEME, open_camera
-from modeler.sequences.makers import LIBRARIES, open_camera_of
+from modeler.sequences.live import LIBRARIES, SCHEME, open_camera, open_camera_of
 from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.tum import open_tum
 from modeler.system.regular_files import check_regular

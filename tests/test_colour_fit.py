@@ -13,7 +13,7 @@ from test_inputs_plain_errors import colour_as
 from test_verdict import CAMERA, MIDDLE, poses_of, seen, turned, views_of, whole_run
 
 from modeler import se3
-from modeler.kernels.colour_fit import displaced_correlations
+from modeler.kernels.photometric import displaced_correlations
 from modeler.types import FLIPS, Array, Flip, RayImage
 from modeler.verdict.colour_fit import Displacement, colour_fit
 

@@ -32,7 +32,7 @@ from modeler.export import (
     write_bop,
     write_mesh,
 )
-from modeler.export.formats import cloud_ply, mesh_ply
+from modeler.export.files import cloud_ply, mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.export.placing import upright
 from modeler.export.reading import fault

@@ -16,7 +16,7 @@ from slow_cases import quick_first
 
 from modeler import se3
 from modeler.export import solids
-from modeler.runs.checks import Checks, mesh_checks
+from modeler.runs.presets import Checks, mesh_checks
 from modeler.sequences import open_sequence
 from modeler.system.pictures import encoded
 from modeler.types import Array, InputError, ObjectModel

@@ -19,8 +19,8 @@ from modeler.graph.focal import RELIEF_ERROR
 from modeler.pipeline import Modeler
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration import VisibilityRegistrar
+from modeler.registration.posterior import FocalNuisance
 from modeler.registration.visibility import VisibilityLikelihood
-from modeler.registration.visibility.focal_length import FocalNuisance
 from modeler.registration.visibility.sampling import AdaptiveSampler, GaussianMixture
 from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequence
 from modeler.types import (

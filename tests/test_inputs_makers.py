@@ -15,7 +15,7 @@ import pytest
 
 from modeler.cli import main
 from modeler.sequences import Overrides, open_sequence
-from modeler.sequences.makers import LIBRARIES
+from modeler.sequences.live import LIBRARIES
 from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, InputError, SensorNoise
 from studies.formats.image_folders import raw_depth, small_frames
 

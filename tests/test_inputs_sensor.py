@@ -14,9 +14,8 @@ from modeler.sequences import CalibratedSequence, NoiseModel, bundled, open_sequ
 from modeler.sequences.calibrated import noise_text, object_distance_m
 from modeler.sequences.noise_calibration import Calibration, borders, calibrate, pooled_px
 from modeler.sequences.rendering.depth_sensor import gaussian_field
-from modeler.sequences.rendering.recipe import load_recipe
+from modeler.sequences.rendering.recipe import Tabletop, load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
-from modeler.sequences.rendering.trajectory import Tabletop
 from modeler.types import Frame, InputError
 
 FRAMES = 5

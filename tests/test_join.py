@@ -21,10 +21,9 @@ from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
 from modeler.runs.reopening import reopened
 from modeler.sequences import BopSequence, write_bop
-from modeler.sequences.rendering.recipe import Recipe, Table, Viewpoint
+from modeler.sequences.rendering.recipe import Recipe, Table, Turntable, Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
-from modeler.sequences.rendering.trajectory import Turntable
 from modeler.sequences.tum import trajectory
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, SensorNoise, Stated, Step
 from modeler.views import Sensor

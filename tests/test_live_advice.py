@@ -22,7 +22,7 @@ from modeler.sequences import bundled, open_sequence
 from modeler.suggestion import Belief, Candidate, Suggestions, suggest
 from modeler.types import Failed, Outcome, Step
 from modeler.views import Sensor
-from modeler.viz import blueprint, next_view
+from modeler.viz import blueprint, model_view
 from modeler.viz.stream import open_stream
 
 
@@ -144,13 +144,13 @@ def test_the_recording_holds_what_to_do_next_at_its_frame(modeler: Modeler, step
     advice.join()
     stream.close()
     recording = read(tmp_path / "r.rrd")
-    assert found.ranked[0].words in recording[next_view.WORDS][step.frame.index]["text"][0]
-    assert step.frame.index in recording[next_view.SEEN_CELLS]
+    assert found.ranked[0].words in recording[model_view.WORDS][step.frame.index]["text"][0]
+    assert step.frame.index in recording[model_view.SEEN_CELLS]
 
 
 def test_a_run_that_is_advised_has_a_tab_for_it(steps: list[Step]) -> None:
     for first in (None, steps[0].view):
-        plain, advised = blueprint.layout(first).root_container, blueprint.layout(first, (next_view.tab(first),))
+        plain, advised = blueprint.layout(first).root_container, blueprint.layout(first, (model_view.next_tab(first),))
         assert isinstance(plain, rrb.Tabs)
         assert isinstance(advised.root_container, rrb.Tabs)
         assert len(list(advised.root_container.contents)) == len(list(plain.contents)) + 1

@@ -26,10 +26,9 @@ from modeler.sequences.rendering.labels import (
     gamma_coded,
 )
 from modeler.sequences.rendering.photography import Lamp, Photography, SmoothNormals
-from modeler.sequences.rendering.recipe import Recipe, Viewpoint, load_recipe
+from modeler.sequences.rendering.recipe import Place, Places, Recipe, Viewpoint, load_recipe
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import AnyShape, Box, Cylinder, MeshFile, Sphere
-from modeler.sequences.rendering.trajectory import Place, Places
 from modeler.system.pictures import linear_light
 from modeler.types import Array, InputError
 

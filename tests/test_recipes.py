@@ -13,7 +13,16 @@ from slow_cases import sampled
 from modeler import se3
 from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.meshes import outer_surface, ply_bytes
-from modeler.sequences.rendering.recipe import Viewpoint, load_recipe
+from modeler.sequences.rendering.recipe import (
+    Hand,
+    Place,
+    Places,
+    RobotReadings,
+    Tabletop,
+    Turntable,
+    Viewpoint,
+    load_recipe,
+)
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import (
     AnyShape,
@@ -30,7 +39,6 @@ from modeler.sequences.rendering.shapes import (
     Torus,
     ear_clipped,
 )
-from modeler.sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop, Turntable
 from modeler.types import InputError
 from studies.calibration.specimens import load_specimen, recipe_names
 

@@ -22,10 +22,21 @@ from modeler.sequences.rendering.depth_sensor import (
     RandomLoss,
     gaussian_field,
 )
-from modeler.sequences.rendering.recipe import Mosaic, Recipe, Table, Viewpoint, Wall, load_recipe
+from modeler.sequences.rendering.recipe import (
+    Hand,
+    Mosaic,
+    Place,
+    Places,
+    Recipe,
+    RobotReadings,
+    Table,
+    Tabletop,
+    Viewpoint,
+    Wall,
+    load_recipe,
+)
 from modeler.sequences.rendering.renderer import RenderedSequence, render
 from modeler.sequences.rendering.shapes import AnyShape, Box, Compound, Part, Sphere
-from modeler.sequences.rendering.trajectory import Hand, Place, Places, RobotReadings, Tabletop
 from modeler.types import Camera, Frame, InputError
 from studies.calibration.specimens import load_specimen
 

@@ -22,7 +22,7 @@ from turning_box import CENTRE_M, COUNT, HALF_M, LOST, object_from_camera, steps
 from modeler import se3
 from modeler.cli import main
 from modeler.export import RunFolder, RunMeta
-from modeler.export.formats import mesh_ply
+from modeler.export.files import mesh_ply
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.fusion import Symmetries
 from modeler.fusion.symmetries import Axis

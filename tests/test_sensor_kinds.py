@@ -16,7 +16,7 @@ from modeler import se3
 from modeler.evaluation import true_motion
 from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.systematic import displacement, of_multipath
+from modeler.registration.posterior import displacement, of_multipath
 from modeler.sequences import Overrides, open_sequence
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, InputError, SensorNoise

@@ -28,10 +28,9 @@ from modeler.priors import TablePrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Scene
 from modeler.sequences.rendering.depth_sensor import DepthSensor
-from modeler.sequences.rendering.recipe import Recipe, Table, TurnedOver, Viewpoint
+from modeler.sequences.rendering.recipe import Recipe, Table, Tabletop, TurnedOver, Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Box, Capsule, Compound, Part, Sphere
-from modeler.sequences.rendering.trajectory import Tabletop
 from modeler.types import (
     Array,
     Edge,

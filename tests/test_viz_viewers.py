@@ -27,8 +27,7 @@ from turning_box import COUNT
 
 from modeler.types import Step
 from modeler.viz import entities, viewer
-from modeler.viz.destinations import RecordingFile, Shown
-from modeler.viz.stream import RerunStream, open_stream
+from modeler.viz.stream import RecordingFile, RerunStream, Shown, open_stream
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -129,7 +128,7 @@ def test_a_viewer_that_is_already_open_may_be_closed_while_the_run_goes_on(run: 
 def test_a_viewer_that_freezes_does_not_stop_the_run(
     run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("modeler.viz.destinations._PATIENCE_S", 0.5)
+    monkeypatch.setattr("modeler.viz.stream._PATIENCE_S", 0.5)
     monkeypatch.setattr("modeler.viz.viewer._STOP_S", 0.2)
     stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     stream(run[0])
@@ -143,15 +142,14 @@ def test_a_viewer_that_freezes_does_not_stop_the_run(
 _STREAM = """\
 import os, resource, signal, socket, sys, threading
 from modeler.cli.console import endable
-from modeler.viz import destinations
-from modeler.viz.stream import open_stream
+import modeler.viz.stream
 from turning_box import steps
 from pathlib import Path
 
 silent = socket.create_server(("127.0.0.1", 0))
 watched = f"rerun+http://127.0.0.1:{silent.getsockname()[1]}/proxy" if sys.argv[3:] else None
-destinations._PATIENCE_S = 30.0 if sys.argv[4:] else 0.2
-stream = open_stream("box", save=Path(sys.argv[1]), connect=watched)
+modeler.viz.stream._PATIENCE_S = 30.0 if sys.argv[4:] else 0.2
+stream = modeler.viz.stream.open_stream("box", save=Path(sys.argv[1]), connect=watched)
 most = int(sys.argv[2]) or resource.RLIM_INFINITY
 resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
 for step in steps(2):
@@ -198,7 +196,7 @@ def test_a_signal_while_a_silent_viewer_is_waited_for_ends_the_process(tmp_path:
 def test_a_viewer_that_is_far_behind_is_left_out(caplog: pytest.LogCaptureFixture, monkeypatch: Any) -> None:
     released, unregistered = threading.Event(), threading.Event()
     monkeypatch.setattr("rerun.unregister_shutdown", unregistered.set)
-    monkeypatch.setattr("modeler.viz.destinations._STOP_S", 0.2)
+    monkeypatch.setattr("modeler.viz.stream._STOP_S", 0.2)
     recording: Any = SimpleNamespace(disconnect=lambda: None)
     shown, begun = Shown(recording), threading.Event()
     shown.put(lambda _: (begun.set(), released.wait()))
@@ -216,7 +214,7 @@ def test_a_disk_that_hangs_does_not_hold_the_run(
 ) -> None:
     unregistered, released = threading.Event(), threading.Event()
     monkeypatch.setattr("rerun.unregister_shutdown", unregistered.set)
-    monkeypatch.setattr("modeler.viz.destinations._DISK_PATIENCE_S", 0.2)
+    monkeypatch.setattr("modeler.viz.stream._DISK_PATIENCE_S", 0.2)
     recording: Any = SimpleNamespace(disconnect=released.wait, set_sinks=lambda sink: None)
     file = RecordingFile(tmp_path / "r.rrd")
     file.attach(recording)

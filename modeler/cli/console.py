@@ -134,7 +134,7 @@ def endable() -> Iterator[None]:
         try:
             yield
         except BaseException as error:
-            streams: Any = sys.modules.get("modeler.viz.destinations")
+            streams: Any = sys.modules.get("modeler.viz.stream")
             with contextlib.suppress(AttributeError):  # they are not, or were just being, imported
                 streams.let_go()  # it may have been in the middle of taking leave of a silent viewer
             if not got or isinstance(error, KeyboardInterrupt | SystemExit):

@@ -31,7 +31,7 @@ class Edit:
     def run(self) -> int:
         """Edit the run; status 3 if the result cannot be trusted; report.json has the reasons."""
         from modeler.export import RunFolder, poses_of
-        from modeler.runs.editing import edit
+        from modeler.runs.joining import edit
         from modeler.runs.outputs import check_run_folder, run_inputs
         from modeler.types import InputError
 

@@ -2,10 +2,10 @@
 
 from modeler.export.bop import scene_gt_info as scene_gt_info
 from modeler.export.bop import write_bop as write_bop
+from modeler.export.files import g2o_text as g2o_text
 from modeler.export.files import locked as locked
+from modeler.export.files import tum_text as tum_text
 from modeler.export.files import write_atomically as write_atomically
-from modeler.export.formats import g2o_text as g2o_text
-from modeler.export.formats import tum_text as tum_text
 from modeler.export.mesh import AS_GIVEN as AS_GIVEN
 from modeler.export.mesh import FORMATS as FORMATS
 from modeler.export.mesh import files_of as files_of

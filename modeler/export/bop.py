@@ -14,8 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from modeler import se3
-from modeler.export.files import write_atomically
-from modeler.export.formats import ply_bytes
+from modeler.export.files import ply_bytes, write_atomically
 from modeler.export.placing import Placement
 from modeler.system.pictures import raycaster, tensor
 from modeler.system.regular_files import read_json

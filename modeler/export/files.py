@@ -1,4 +1,4 @@
-"""Files that are either there and whole, or not there."""
+"""Files that programs exchange: their text, and how they are written so that no reader sees half of one."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import errno
 import fcntl
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
 from modeler.system.regular_files import left_behind
-from modeler.types import InputError
+from modeler.types import Array, Edge, InputError, ObjectModel, Solution
 
 PART = ".part"  # ending of a file that is still being written
 
@@ -97,3 +101,121 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(held)  # which a killed program does, too
+
+
+_TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
+
+
+def pose_text(pose: Array) -> str:
+    """Return `tx ty tz qx qy qz qw` of a pose (4, 4), in m, with every digit that it has and qw not negative."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return " ".join(repr(float(value)) for value in (*pose[:3, 3], *quaternion))
+
+
+def tum_text(trajectory: Mapping[int, Array], times_s: Mapping[int, float]) -> str:
+    """Return one line `timestamp tx ty tz qx qy qz qw` per pose, in order of time.
+
+    Args:
+        trajectory: object_from_camera (4, 4) by frame number.
+        times_s: time of capture in s by frame number.
+    """
+    frames = sorted(trajectory, key=lambda frame: (times_s[frame], frame))
+    return "".join(f"{float(times_s[frame])!r} {pose_text(trajectory[frame])}\n" for frame in frames)
+
+
+def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
+    """Return the solved graph as VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines, numbers written in full.
+
+    Vertices are object_from_camera, edges `target source target_from_source` as used: of an edge with several modes,
+    the selected one. Information matrices are marginal over the focal length, of translation first, then rotation in
+    rad, as g2o orders them and GTSAM reads and writes them. (g2o itself measures rotation by the vector part of a
+    quaternion, half the angle: it reads such files, GTSAM's too, with twice the rotation uncertainty.)
+
+    Args:
+        edges: those that take part are written: accepted, no outliers, both ends solved.
+        solution: the poses.
+    """
+    lines = [
+        f"VERTEX_SE3:QUAT {frame} {pose_text(solution.trajectory[frame])}" for frame in sorted(solution.trajectory)
+    ]
+    for edge in edges:
+        solved = edge.target in solution.trajectory and edge.source in solution.trajectory
+        if solved and solution.takes_part(edge):
+            pose = solution.pose_of(edge)
+            covariance = pose.covariance if solution.focal is None else pose.widened(solution.focal.sigma).covariance
+            numbers = " ".join(repr(float(value)) for value in _upper_triangle(covariance))
+            lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {pose_text(pose.mean)} {numbers}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _upper_triangle(covariance: Array) -> Array:
+    """Return the upper triangle (21,), row by row, of the information (6, 6) that belongs to a covariance (6, 6)."""
+    permuted = covariance[np.ix_(_TRANSLATION_FIRST, _TRANSLATION_FIRST)]
+    whitening = np.linalg.inv(np.linalg.cholesky(permuted))
+    return (whitening.T @ whitening)[np.triu_indices(6)]
+
+
+def cloud_ply(model: ObjectModel) -> bytes:
+    """Return the merged cloud of a model as PLY."""
+    return ply_bytes(model.points_m, model.normals, model.colours)
+
+
+def mesh_ply(model: ObjectModel) -> bytes:
+    """Return the mesh of a model as PLY; vertices also have `views` and `sigma_m`, if known."""
+    return ply_bytes(
+        model.vertices_m,
+        model.vertex_normals,
+        model.vertex_colours,
+        model.triangles,
+        views=model.vertex_views,
+        sigmas_m=model.vertex_sigmas_m,
+    )
+
+
+def ply_bytes(
+    points_m: Array,
+    normals: Array,
+    colours: npt.NDArray[np.uint8] | None = None,
+    triangles: npt.NDArray[np.int64] | None = None,
+    *,
+    views: npt.NDArray[np.int64] | None = None,
+    sigmas_m: Array | None = None,
+) -> bytes:
+    """Return a little-endian PLY file.
+
+    Args:
+        points_m: (n, 3); stored as 32-bit floats, 0.06 µm at a distance of 1 m.
+        normals: (n, 3) unit vectors.
+        colours: (n, 3) RGB.
+        triangles: (t, 3) vertex numbers; None: a cloud, without a face element.
+        views: (n,) number of views that saw each point, stored as `views`; 0 = interpolated.
+        sigmas_m: (n,) standard deviation along the normal, stored as `sigma_m`; inf, stored as -1, where there is none.
+    """
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    fields = [(name, "<f4") for name in names]
+    header = [f"property float {name}" for name in names]
+    values = list(np.concatenate([points_m, normals], axis=1).T)
+    if colours is not None:
+        names = ["red", "green", "blue"]
+        fields += [(name, "u1") for name in names]
+        header += [f"property uchar {name}" for name in names]
+        values += list(colours.T)
+    if views is not None:
+        fields.append(("views", "<u2"))
+        header.append("property ushort views")
+        values.append(np.minimum(views, np.iinfo(np.uint16).max))
+    if sigmas_m is not None:
+        fields.append(("sigma_m", "<f4"))
+        header.append("property float sigma_m")
+        values.append(np.where(np.isfinite(sigmas_m), sigmas_m, -1.0))  # readers of PLY stumble over inf
+    vertices = np.empty(len(points_m), dtype=fields)
+    for (name, _), column in zip(fields, values, strict=True):
+        vertices[name] = column
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *header]
+    body = vertices.tobytes()
+    if triangles is not None:
+        faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", (3,))])
+        faces["count"], faces["corners"] = 3, triangles
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        body += faces.tobytes()
+    return "\n".join([*header, "end_header", ""]).encode() + body

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from modeler.export.files import write_atomically
-from modeler.export.formats import mesh_ply
+from modeler.export.files import mesh_ply, write_atomically
 from modeler.export.placing import CAMERA_AXES
 from modeler.system.pictures import encoded, linear_light, raycaster, tensor
 from modeler.system.processes import check_installed

@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.export.bop import silhouettes
-from modeler.export.files import write_atomically
-from modeler.export.formats import ply_bytes
+from modeler.export.files import ply_bytes, write_atomically
 from modeler.system.pictures import encoded
 from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel
 

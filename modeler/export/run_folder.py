@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from modeler.export.files import PART, settle, settle_soon, write_atomically
-from modeler.export.formats import cloud_ply, g2o_text, mesh_ply, tum_text
+from modeler.export.files import PART, cloud_ply, g2o_text, mesh_ply, settle, settle_soon, tum_text, write_atomically
 from modeler.export.pairs import Pairs
 from modeler.export.reading import fault
 from modeler.export.report import RunMeta, report_of

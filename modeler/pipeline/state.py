@@ -12,7 +12,7 @@ from modeler import se3
 from modeler.closure import MapView, PathNetwork
 from modeler.graph import CommonAxis, PoseGraph, Smoother
 from modeler.pipeline.pairs import Prepared
-from modeler.registration.systematic import of_multipath
+from modeler.registration.posterior import of_multipath
 from modeler.system.disk_arrays import ViewStore
 from modeler.types import (
     AbstractPrior,

@@ -1,8 +1,13 @@
-"""Statistics of weighted samples, and posteriors of failed registrations."""
+"""Posteriors of registrations: statistics of samples, the focal length as a nuisance, errors alike, and failures."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from modeler import se3
+from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
@@ -99,3 +104,69 @@ def intrinsics(view: RayImage) -> Array:
     """Return fx, fy, cx, cy (4,) in px of a view's camera."""
     camera = view.frame.camera
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+
+
+_OPEN = 1e-3  # of the best determined direction's information: surface says nothing of less
+_DIFFERS: Final = 0.08**2
+"""Share of the variance of smooth errors of depth that moves one view against another.
+
+The rest is alike in both, as light comes from the same surroundings. Measured on rendered time of flight (tuning half):
+with it NEES/6 is 0.8, and 95 % regions hold 91 %.
+"""
+
+
+def displacement(arms_m: Array, normals: Array, size_m: float) -> Array:
+    """Return the covariance (6, 6) of ξ of least squares of point-to-plane distances with a common sd of 1 m.
+
+    The rows are a = (p × n, n), and the covariance is (Σ a aᵀ / N)⁻¹, without directions that surface leaves open.
+
+    Args:
+        arms_m: (n, 3) points p, relative to the origin of ξ; at least one.
+        normals: (n, 3).
+        size_m: of the surface: a length by which rotations are compared with shifts.
+    """
+    scale = np.repeat([1.0 / size_m, 1.0], 3)
+    rows = np.concatenate([np.cross(arms_m, normals), normals], axis=1) * scale
+    values, axes = np.linalg.eigh(rows.T @ rows / len(rows))
+    spread = np.where(values > _OPEN * values[-1], 1.0 / np.maximum(values, 1e-12), 0.0)
+    return np.asarray((axes * spread) @ axes.T * np.outer(scale, scale), dtype=np.float64)
+
+
+def of_multipath(view: RayImage) -> Array:
+    """Return the covariance (6, 6) of ξ in target_from_source · Exp(ξ) due to smooth errors of depth of both views.
+
+    Args:
+        view: the source.
+    """
+    if view.sigma_multipath == 0.0 or not len(view.points_m):
+        return np.zeros((6, 6))
+    about = _DIFFERS * view.multipath_m**2 * displacement(view.points_m - view.centroid_m, view.normals, view.size_m)
+    return se3.covariance_about(about, -view.centroid_m)
+
+
+class FocalNuisance(NamedTuple):
+    """What is known of the focal length, and how poses depend on it."""
+
+    sigma: float = 0.0
+    """Standard deviation of the logarithm of the true focal length over that of the views; 0 = it is known."""
+    by_focal: Array = np.zeros(6)
+    """(6,) derivative of a pose's ξ by that logarithm."""
+
+    def draw(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw logarithms (count,) of focal lengths."""
+        return rng.normal(0.0, self.sigma, count) if self.sigma > 0.0 else np.zeros(count)
+
+    def under(self, poses: Array, log_focal: Array) -> Array:
+        """Return poses (n, 4, 4) under other focal lengths, given as logarithms (n,) of their factors."""
+        return poses @ se3.exp(log_focal[:, None] * self.by_focal) if log_focal.any() else poses
+
+
+KNOWN: Final = FocalNuisance()
+"""A focal length that is known."""
+
+
+def rows_under(poses: Array, log_focal: Array | None) -> Array:
+    """Return the rows (n, 12) of poses (n, 4, 4) for kernels; under logarithms (n,) of focal lengths (n, 13)."""
+    if log_focal is None or not log_focal.any():
+        return rows(poses)
+    return np.column_stack([rows(poses), np.exp(log_focal)])

@@ -4,12 +4,12 @@ Lengths are metres and angles radians unless a name says otherwise; `se3` holds 
 All values are frozen.
 """
 
-from modeler.types.arguments import checked as checked
 from modeler.types.base import Array as Array
 from modeler.types.base import BoolArray as BoolArray
 from modeler.types.base import Float32Array as Float32Array
 from modeler.types.base import InputError as InputError
 from modeler.types.base import Outcome as Outcome
+from modeler.types.base import checked as checked
 from modeler.types.base import spread as spread
 from modeler.types.interfaces import AbstractPairCache as AbstractPairCache
 from modeler.types.interfaces import AbstractPoseDensity as AbstractPoseDensity

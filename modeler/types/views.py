@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.types.arguments import checked
-from modeler.types.base import Array, BoolArray, InputError, Outcome
+from modeler.types.base import Array, BoolArray, InputError, Outcome, checked
 
 Flip = Literal["", "mirrored", "upside down", "flipped top to bottom"]
 FLIPS: Final[Mapping[Flip, tuple[float, float]]] = {

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from modeler import se3
-from modeler.kernels.colour_fit import displaced_correlations
+from modeler.kernels.photometric import displaced_correlations
 from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage, spread
 
 MAX_VIEWS: Final = 40  # spread over the run: steps of 9° in a full turn

@@ -20,9 +20,8 @@ from modeler.sequences.rendering.depth_sensor import EXACT, DepthSensor, Exposur
 from modeler.sequences.rendering.labels import LabelledMesh
 from modeler.sequences.rendering.meshes import Caster, Hits, outer_surface, ply_bytes
 from modeler.sequences.rendering.photography import LitMesh, Photography
-from modeler.sequences.rendering.recipe import Mosaic, Recipe
+from modeler.sequences.rendering.recipe import Hand, Mosaic, Recipe
 from modeler.sequences.rendering.shapes import Box, placement
-from modeler.sequences.rendering.trajectory import Hand
 from modeler.types import Array, Camera, Frame, InputError, SensorNoise
 
 _WALL_THICKNESS_M = 0.05  # any: only its front is seen

@@ -16,7 +16,7 @@ from modeler.sequences.lens import Alignment, Lens
 from modeler.sequences.recording import AbstractStreams, paired
 from modeler.sequences.ros import messages
 from modeler.sequences.ros.bag import Bag, Stamp
-from modeler.sequences.ros.metadata import (
+from modeler.sequences.ros.messages import (
     realsense_colour_from_depth,
     realsense_lens,
     realsense_unit_mm,

@@ -25,7 +25,7 @@ from modeler.composition.options import MethodOptions, ObjectOptions
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export import RunFolder, RunMeta
 from modeler.pipeline import NewestFrames
-from modeler.sequences.rendering.trajectory import Hand
+from modeler.sequences.rendering.recipe import Hand
 from modeler.system.concurrency import in_background
 from modeler.types import Frame, Step
 from modeler.viz.stream import open_stream

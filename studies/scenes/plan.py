@@ -11,10 +11,9 @@ from scipy import ndimage
 
 from modeler import se3
 from modeler.composition.options import PriorOptions
-from modeler.sequences.rendering.recipe import Recipe, Table, Wall
+from modeler.sequences.rendering.recipe import Place, Places, Recipe, Table, Tabletop, Wall
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import AnyShape, Box, Capsule, Cylinder
-from modeler.sequences.rendering.trajectory import Place, Places, Tabletop
 from modeler.types import Array, BoolArray, Frame
 from studies.calibration.specimens import load_specimen
 from studies.trust.plan import HALVES, SHIFT_M, Half, shapes, viewed

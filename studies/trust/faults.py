@@ -10,9 +10,8 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.composition.options import PriorOptions
-from modeler.sequences.rendering.recipe import Recipe, Wall
+from modeler.sequences.rendering.recipe import Place, Places, Recipe, Tabletop, Turntable, Wall
 from modeler.sequences.rendering.shapes import AnyShape, Box, Capsule, Compound, Part
-from modeler.sequences.rendering.trajectory import Place, Places, Tabletop, Turntable
 from modeler.types import BoolArray, Frame
 from studies.calibration.specimens import Symmetry
 from studies.trust.stage import Stage, posed

@@ -11,8 +11,7 @@ import numpy as np
 from modeler.composition.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.sequences.rendering.depth_sensor import DepthSensor
-from modeler.sequences.rendering.recipe import Recipe
-from modeler.sequences.rendering.trajectory import Places, Tabletop, Turntable
+from modeler.sequences.rendering.recipe import Places, Recipe, Tabletop, Turntable
 from studies.calibration.specimens import SPECIMENS, Symmetry, load_specimen
 from studies.trust.faults import FAULTS, Fault
 from studies.trust.stage import WIDTH_PX, Stage, posed

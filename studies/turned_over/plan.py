@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from modeler.composition.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
-from modeler.sequences.rendering.recipe import Recipe, TurnedOver
+from modeler.sequences.rendering.recipe import Place, Places, Recipe, Tabletop, TurnedOver, Turntable
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import MeshFile
-from modeler.sequences.rendering.trajectory import Place, Places, Tabletop, Turntable
 from modeler.types import Array
 from studies.calibration.specimens import load_specimen
 from studies.scenes.plan import arm

@@ -14,8 +14,8 @@ from modeler.kernels import gauss_newton, point_likelihood, scores
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import Projection
+from modeler.registration.posterior import rows_under
 from modeler.registration.visibility.directed import MISFIT, DirectedLikelihood
-from modeler.registration.visibility.focal_length import rows_under
 from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
 from modeler.registration.visibility.points import (
     FixedPattern,

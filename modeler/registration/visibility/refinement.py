@@ -15,9 +15,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.kernels import point_to_plane
-from modeler.registration.posterior import FLOOR
+from modeler.registration.posterior import FLOOR, KNOWN, FocalNuisance
 from modeler.registration.visibility.directed import DirectedLikelihood
-from modeler.registration.visibility.focal_length import KNOWN, FocalNuisance
 from modeler.registration.visibility.likelihood import MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
 from modeler.registration.visibility.points import OWN_RIM, FixedPattern, IntArray

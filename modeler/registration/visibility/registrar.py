@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.registration.posterior import MIN_MODE_SHARE, failed, share_at_limit, weighted_gaussian
-from modeler.registration.systematic import of_multipath
+from modeler.registration.posterior import MIN_MODE_SHARE, failed, of_multipath, share_at_limit, weighted_gaussian
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner, first_order
 from modeler.registration.visibility.ridge import without_chance

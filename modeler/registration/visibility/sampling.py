@@ -11,8 +11,15 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.kernels import mixture
-from modeler.registration.posterior import FLOOR, MIN_MODE_SHARE, effective_samples, normalised, pareto_tail
-from modeler.registration.visibility.focal_length import KNOWN, FocalNuisance
+from modeler.registration.posterior import (
+    FLOOR,
+    KNOWN,
+    MIN_MODE_SHARE,
+    FocalNuisance,
+    effective_samples,
+    normalised,
+    pareto_tail,
+)
 from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, Array
 
