@@ -42,8 +42,7 @@ from modeler.verdict.advice import remedies
 from modeler.views import Sensor
 from modeler.viz.stream import open_stream
 
-Sink = Callable[[Event], object]
-"""Consumes the events of a run: a `Step` for each frame, and others in between."""
+Sink = Callable[[Event], object]  # consumes the events of a run: a `Step` for each frame, and others in between
 
 
 @final

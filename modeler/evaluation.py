@@ -19,8 +19,7 @@ from modeler import se3
 from modeler.system.pictures import raycaster, tensor
 from modeler.types import Array, BoolArray, Frame, PoseGaussian
 
-LEVELS = (0.5, 0.9, 0.95)
-"""Nominal probabilities of the regions whose coverage is reported."""
+LEVELS = (0.5, 0.9, 0.95)  # nominal probabilities of the regions whose coverage is reported
 
 
 def true_motion(camera_from_model: Mapping[int, Array], target: int, source: int) -> Array:
@@ -153,8 +152,7 @@ def align_to_model(trajectory: Mapping[int, Array], camera_from_model: Mapping[i
     return se3.mean(np.stack(relative), np.ones(len(relative)))[0]
 
 
-SAMPLES = 50_000
-"""Points drawn on a surface."""
+SAMPLES = 50_000  # points drawn on a surface
 _REACHED = 1.0 - 1e-5  # share of the way to a point after which nothing hides it but itself
 
 

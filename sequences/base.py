@@ -12,8 +12,7 @@ from typing import Final, Self, final
 
 from modeler.types import Array, Frame, InputError, SensorNoise
 
-FIRST: Final = 3
-"""Frames of a live source to wait for before the scene is learned from them."""
+FIRST: Final = 3  # frames of a live source to wait for before the scene is learned from them
 
 
 class AbstractSequence(ABC):

@@ -74,10 +74,8 @@ def pose_entry(pose: Array) -> dict[str, object]:
     return {"cam_R_m2c": [float(v) for v in rotation], "cam_t_m2c": [float(v) for v in shift], "obj_id": 1}
 
 
-MASKS = "mask_visib"
-"""Folder of the masks."""
-OCCLUDERS = "mask_hand"
-"""Folder of the masks of occluders: a hand, a gripper."""
+MASKS = "mask_visib"  # folder of the masks
+OCCLUDERS = "mask_hand"  # folder of the masks of occluders: a hand, a gripper
 
 
 @final

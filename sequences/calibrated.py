@@ -16,8 +16,7 @@ from modeler.sequences.base import AbstractDerived
 from modeler.sequences.input_files import Node, read_tree
 from modeler.types import NOMINAL_FOCAL, Array, Camera, Frame, InputError, SensorNoise
 
-MAX_ANGLE_RAD = np.radians(85.0)
-"""Beyond, the model's noise would grow without bounds and is kept constant."""
+MAX_ANGLE_RAD = np.radians(85.0)  # beyond, the model's noise would grow without bounds and is kept constant
 
 
 @final

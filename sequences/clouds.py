@@ -27,8 +27,7 @@ from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import Array, Camera, Frame, InputError
 
 SUFFIXES = (".pcd", ".ply")
-MAX_OFF_PX = 1.0
-"""Points that lie farther (half of them) from their pixels were not seen by a pinhole camera."""
+MAX_OFF_PX = 1.0  # points that lie farther (half of them) from their pixels were not seen by a pinhole camera
 _HEADER_BYTES = 65536  # more than headers take, comments included
 _MOST_BYTES = 1000  # a point, as text with many fields
 _LZF_RATIO = 20  # points a byte: its longest match is 264 bytes in 3, and a point has 6 at the least

@@ -125,8 +125,7 @@ def read_mask(path: Path) -> BoolArray:
     return read_labels(path) != 0
 
 
-OCCLUDED = 128
-"""Value of a mask's pixels that show a hand or a gripper."""
+OCCLUDED = 128  # value of a mask's pixels that show a hand or a gripper
 
 
 def read_labels(path: Path) -> npt.NDArray[np.uint8]:

@@ -214,8 +214,7 @@ MASK_FOLDERS = ("masks", "mask")
 OCCLUDER_FOLDERS = ("mask_hand", "masks_hand")
 CONFIDENCE_FOLDERS = ("confidence",)
 POSES = "annotated_poses"
-FARTHEST_M = 1e6
-"""Largest plausible coordinate of a camera in m."""
+FARTHEST_M = 1e6  # largest plausible coordinate of a camera in m
 
 
 @final
@@ -360,8 +359,7 @@ def open_colour_depth(path: Path, found: FoundImages, overrides: Overrides) -> I
     )
 
 
-VIDEO: Final = "rgb.mp4"
-"""Stray Scanner's, of the same view as depth."""
+VIDEO: Final = "rgb.mp4"  # Stray Scanner's, of the same view as depth
 
 
 def _is_seven_scenes(depth: Path) -> bool:

@@ -114,8 +114,7 @@ def frame_number(stem: str) -> int | None:
     return int(stem) if stem.isascii() and stem.isdigit() and len(stem) <= 9 else None
 
 
-MAX_BYTES = 64_000_000
-"""Larger text is refused."""
+MAX_BYTES = 64_000_000  # larger text is refused
 
 
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")

@@ -14,10 +14,8 @@ from modeler.sequences.input_files import Node, entries, is_there, read_text, re
 from modeler.sequences.lens import Lens, lens_of_model
 from modeler.types import Array, Camera, InputError
 
-Intrinsics = tuple[float, float, float, float]
-"""fx, fy, cx, cy in px."""
-RANGE = "fx and fy from 1 to 1e6, cx and cy from -1e6 to 1e6"
-"""Range of intrinsics, for messages."""
+Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy in px
+RANGE = "fx and fy from 1 to 1e6, cx and cy from -1e6 to 1e6"  # range of intrinsics, for messages
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,7 @@ class Overrides:
             )
 
 
-MAX_ASPECT = 1.5
-"""Pixels are nearly square."""
+MAX_ASPECT = 1.5  # pixels are nearly square
 
 
 def sane(intrinsics: Intrinsics) -> bool:
@@ -78,12 +75,9 @@ NAMES = (
     "metadata",
 )
 """Files that are looked for, in this order; after them, files of YAML (OpenCV, ROS, ORB-SLAM, Kalibr)."""
-OF_PHONES = ("camera_matrix.csv", "metadata.json", "metadata", "cameras/")
-"""Of Stray Scanner, Record3D and Polycam."""
-OF_COLOUR = (*OF_PHONES, "transforms.json")
-"""Intrinsics of colour images, whose view depth has in fewer pixels."""
-_PHONE_SIZE = (1920, 1440)
-"""Images of Stray Scanner, whose file does not state their size."""
+OF_PHONES = ("camera_matrix.csv", "metadata.json", "metadata", "cameras/")  # of Stray Scanner, Record3D and Polycam
+OF_COLOUR = (*OF_PHONES, "transforms.json")  # intrinsics of colour images, whose view depth has in fewer pixels
+_PHONE_SIZE = (1920, 1440)  # images of Stray Scanner, whose file does not state their size
 
 
 @final

@@ -112,13 +112,10 @@ def coefficients(values: Sequence[float]) -> tuple[float, ...]:
     return tuple(numbers)
 
 
-OCCLUSION_SHARE = 0.02
-"""Relative depth behind the nearest surface from which on a point counts as occluded."""
+OCCLUSION_SHARE = 0.02  # relative depth behind the nearest surface from which on a point counts as occluded
 
-NEIGHBOUR_M = 0.02
-"""Occluded pixels take the colour of the nearest visible surface within this distance."""
-STRIDE = 3
-"""Stride over the visible points in that search."""
+NEIGHBOUR_M = 0.02  # occluded pixels take the colour of the nearest visible surface within this distance
+STRIDE = 3  # stride over the visible points in that search
 
 
 @final

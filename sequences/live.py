@@ -20,12 +20,10 @@ from modeler.sequences.lens import Lens, coefficients
 from modeler.system.processes import install_command
 from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, Camera, Frame, InputError, SensorNoise
 
-FIRST = 10
-"""Number of frames taken before the sequence is described."""
+FIRST = 10  # number of frames taken before the sequence is described
 
 
-MAX_REPEATS = 100
-"""Largest number of repetitions of one image."""
+MAX_REPEATS = 100  # largest number of repetitions of one image
 
 
 Image = tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]
@@ -142,14 +140,11 @@ def _next(camera: RunningCamera, number: int, after_s: float | None) -> Frame:
     raise InputError(f"{camera.name}: gives the same image again and again; reconnect it.")
 
 
-SCHEME = "realsense:"
-"""Prefix of a path that selects a camera; its serial number may follow."""
+SCHEME = "realsense:"  # prefix of a path that selects a camera; its serial number may follow
 ADVICE = f"a RealSense camera is read by its maker's library; {install_command('realsense')}"
-WARM_UP = 30
-"""Images after which exposure has settled."""
+WARM_UP = 30  # images after which exposure has settled
 TIMEOUT_MS = 5000  # a camera that gives nothing for so long is gone
-REACH_M = 16.0
-"""Depth of a live camera beyond this is a measurement error; less fits 16 bits of a fine unit."""
+REACH_M = 16.0  # depth of a live camera beyond this is a measurement error; less fits 16 bits of a fine unit
 _TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")
 """Names of models that measure so; others see structured light or stereo pairs."""
 

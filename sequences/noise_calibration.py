@@ -15,18 +15,13 @@ from modeler.sequences.base import AbstractSequence
 from modeler.sequences.calibrated import NoiseModel, slope_terms
 from modeler.types import Array, BoolArray, Camera, InputError
 
-REACH = 4
-"""Pixels on either side of a border that must belong to the near and to the far thing."""
-MIN_JUMP = 0.03
-"""Least step of depth at a border, as a share of the depth."""
-LARGEST_STEP_PX = 1.5
-"""Largest step of an edge from row to row in px."""
-WIDEST_SHADOW_PX = 60
-"""A near thing that is followed by nothing for longer is not known to have a border there."""
+REACH = 4  # pixels on either side of a border that must belong to the near and to the far thing
+MIN_JUMP = 0.03  # least step of depth at a border, as a share of the depth
+LARGEST_STEP_PX = 1.5  # largest step of an edge from row to row in px
+WIDEST_SHADOW_PX = 60  # a near thing that is followed by nothing for longer is not known to have a border there
 STEEPEST = 1.5
 """Columns a row; steeper borders are measured along the other axis alone, those about the diagonal along both."""
-WINDOW = 9
-"""Rows over which a border is compared with a smooth curve."""
+WINDOW = 9  # rows over which a border is compared with a smooth curve
 
 
 @final
@@ -84,7 +79,7 @@ def _positions(depth_m: Array, middle_m: Array) -> Array:
         for step in range(1, REACH + 1):
             beyond = middle_m[:, REACH - 1 + step :][:, :width]
             good &= np.isnan(beyond) | (beyond > near + jump)
-        # A camera with a projector has no depth in the shadow of the near object; the next measurement must be farther.
+        # a camera with a projector has no depth in the shadow of the near object; the next measurement must be farther.
         good &= _following(middle_m)[:, REACH:][:, :width] > near + jump
     rows, starts = np.nonzero(good)
     columns = starts + REACH - 1
@@ -141,18 +136,12 @@ def _measured(chain: Array, frames: int) -> list[DepthEdge]:
     return [DepthEdge(variance, float(np.median(chain[:, 3])), int(np.count_nonzero(straight)))]
 
 
-HALF = 3
-"""Half width of the window of the quadric fit in px."""
-MAX_BEND = 0.05
-"""Where neighbours differ by more than this share of the depth, there is no surface."""
-DISTANCE_STEP = 1.15
-"""Ratio of the ends of a class of distances."""
-ANGLE_STEP_RAD = np.radians(10.0)
-"""Width of a class of angles."""
-MIN_PIXELS = 200
-"""Classes with fewer pixels say nothing."""
-STEEPEST_RAD = np.radians(80.0)
-"""Steeper surfaces are not measured: the quadric spans too much of them."""
+HALF = 3  # half width of the window of the quadric fit in px
+MAX_BEND = 0.05  # where neighbours differ by more than this share of the depth, there is no surface
+DISTANCE_STEP = 1.15  # ratio of the ends of a class of distances
+ANGLE_STEP_RAD = np.radians(10.0)  # width of a class of angles
+MIN_PIXELS = 200  # classes with fewer pixels say nothing
+STEEPEST_RAD = np.radians(80.0)  # steeper surfaces are not measured: the quadric spans too much of them
 
 
 @final
@@ -260,10 +249,8 @@ def _calm_mean(values: Array) -> float:
     return float(values[values < limit].mean())
 
 
-MOST_FRAMES = 40
-"""More frames of a still scene add little."""
-MAX_MOVING = 0.02
-"""Share of the pixels that may change by more than noise."""
+MOST_FRAMES = 40  # more frames of a still scene add little
+MAX_MOVING = 0.02  # share of the pixels that may change by more than noise
 
 
 @final
@@ -311,7 +298,7 @@ def calibrate(sequence: AbstractSequence) -> Calibration:
     if not bins:
         raise InputError(f"{sequence.name}: shows no smooth surface; put flat things at several distances and angles.")
     floor_m, growth = fit_growth(bins)
-    # A constant border is still uncertain within its pixel.
+    # a constant border is still uncertain within its pixel.
     lateral_px = max(lateral_px, float(np.sqrt(1.0 / 12.0)))
     model = NoiseModel(lateral_px, 0.5 * (camera.fx + camera.fy), floor_m, growth)
     return Calibration(model, tuple(bins), tuple(found), len(frames))

@@ -121,8 +121,7 @@ class AbstractRecording(AbstractSequence):
         return read_tree(path) if is_there(path) else None
 
 
-MOTIONS = ("general", "table", "turntable", "held", "poke")
-"""Kinds of motion, each a prior."""
+MOTIONS = ("general", "table", "turntable", "held", "poke")  # kinds of motion, each a prior
 _RANGES = {"step_deg": (-360.0, 360.0), "sigma_deg": (0.0, 180.0), "shift_m": (0.0, 10.0)}
 
 
@@ -156,8 +155,7 @@ def _poke(node: Node) -> dict[str, object]:
     return {"point_m": point_m.tolist(), "direction": direction.tolist(), "length_m": length_m}
 
 
-Stamp = TypeVar("Stamp")
-"""Key of an image in its stream."""
+Stamp = TypeVar("Stamp")  # key of an image in its stream
 MAX_APART_S = 0.02
 """Depth and colour farther apart in time than this are no pair (the TUM benchmark's own tool has the same)."""
 

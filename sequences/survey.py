@@ -19,8 +19,7 @@ from modeler.sequences.intrinsics import MAX_ASPECT
 from modeler.types import Camera, Float32Array, Frame, InputError
 
 NEAREST_M = 0.01
-FARTHEST_M = 100.0
-"""Range of the median depth; beyond, the unit is wrong."""
+FARTHEST_M = 100.0  # range of the median depth; beyond, the unit is wrong
 
 
 PLAUSIBLE_M = (0.1, 5.0)
@@ -33,26 +32,20 @@ LIKELY_M = (0.25, 5.0)
 OFF_MIDDLE = 0.1
 """Principal points lie within such a share of an image's longer side of its middle; farther off, cx and cy may be
 exchanged."""
-FAR_OFF_MIDDLE = 0.3
-"""Beyond such a share no whole image has it, but cut-out ones and intrinsics of larger images do."""
+FAR_OFF_MIDDLE = 0.3  # beyond such a share no whole image has it, but cut-out ones and intrinsics of larger images do
 IN_MIDDLE = 0.04
 """Within such a share calibrated cameras have it. Cut-out images may have it anywhere: only there, once exchanged or
 scaled to the images, is an error plain."""
-USUAL_FIELD_DEG = (1.0, 135.0)
-"""Fields of view of depth cameras, crops included."""
-WIDEST_FIELD_DEG = 170.0
-"""No pinhole camera sees more."""
+USUAL_FIELD_DEG = (1.0, 135.0)  # fields of view of depth cameras, crops included
+WIDEST_FIELD_DEG = 170.0  # no pinhole camera sees more
 BENT = 1.5
 """Ratio of the shares on a plane from which depth is the distance along the ray: 2 to 6 in scenes with a table."""
-LEAST_FLAT = 0.15
-"""Least share of the pixels that such a plane has."""
-INSPECTED = 6
-"""Number of frames, spread over the sequence, whose planes and edges are looked at."""
+LEAST_FLAT = 0.15  # least share of the pixels that such a plane has
+INSPECTED = 6  # number of frames, spread over the sequence, whose planes and edges are looked at
 _SIGMA_OF_SECOND_DIFFERENCES = 1.0 / (0.6745 * 6.0**0.5)  # times their median size: weights 1, -2 and 1
 LEAST_JOINED = 0.3
 """Depth cameras measure whole areas; where fewer pixels have measured neighbours, it is lines or single points."""
-MOST_NOISE = 0.008
-"""Scatter as a share of depth. A Kinect 1 at 3 m, the noisiest camera measured, has 0.4 %."""
+MOST_NOISE = 0.008  # scatter as a share of depth. A Kinect 1 at 3 m, the noisiest camera measured, has 0.4 %.
 
 
 @final

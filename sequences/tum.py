@@ -18,12 +18,10 @@ from modeler.sequences.intrinsics import CameraFacts, Overrides, find_intrinsics
 from modeler.sequences.recording import paired
 from modeler.types import Array, InputError
 
-UNIT_MM = 0.2
-"""The benchmark stores 5000 units per metre."""
+UNIT_MM = 0.2  # the benchmark stores 5000 units per metre
 CALIBRATION = (525.0, 525.0, 319.5, 239.5)
 """Intrinsics recommended by the benchmark for its images of 640 x 480, which come without intrinsics."""
-MAX_GAP_S = 0.2
-"""Ground truth is not interpolated over longer gaps."""
+MAX_GAP_S = 0.2  # ground truth is not interpolated over longer gaps
 
 
 def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:

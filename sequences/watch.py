@@ -19,10 +19,8 @@ from modeler.types import Frame, InputError, checked
 
 _log = logging.getLogger(__name__)
 
-END = "done"
-"""A file of this name in the folder marks the end of the sequence."""
-POLL_S = 0.05
-"""Polling interval of the folder."""
+END = "done"  # a file of this name in the folder marks the end of the sequence
+POLL_S = 0.05  # polling interval of the folder
 REST = 3.0
 """So many times as long as looking took is rested at least: of 10,000 frames it takes 10 ms, with new ones 0.1 s."""
 

@@ -15,11 +15,9 @@ from scipy.spatial.transform import Rotation
 from modeler.types import Array, Posterior, Step
 from modeler.viz import entities
 
-Drawing = Iterator[tuple[str, rr.AsComponents]]
-"""Entities in the order in which they are logged."""
+Drawing = Iterator[tuple[str, rr.AsComponents]]  # entities in the order in which they are logged
 
-CLEAR: Final = rr.Clear(recursive=False)
-"""Clears an entity."""
+CLEAR: Final = rr.Clear(recursive=False)  # clears an entity
 
 
 POINT_SIZE: Final = rr.Radius.ui_points(1.75)

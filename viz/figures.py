@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     from modeler.experiment import Trial
 
-LEAST_DEG: Final = 0.01
-"""Errors below this are drawn here, on the axis' lower end."""
+LEAST_DEG: Final = 0.01  # errors below this are drawn here, on the axis' lower end
 MOST_DEG: Final = 180.0
 
 _COLOURS: Final = ("#3b6fb6", "#e08e2b", "#4f9d69", "#b8474a", "#7d6bb0", "#8a6f57", "#c77fb0", "#6e6e6e")

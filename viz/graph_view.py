@@ -17,8 +17,7 @@ from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, Drawing, Ellipsoids, caption, rotated, rounded_down, scale_words
 from modeler.viz.readings import pose_table
 
-OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])
-"""From the object towards the eye that looks at the whole graph."""
+OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])  # from the object towards the eye that looks at the whole graph
 
 _POSES: Final = 150  # largest number of poses that are all drawn; of more, every n-th
 _CAMERA_SIZE: Final = 0.1  # as a share of the distance to the object

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from modeler.suggestion import Belief, Suggestions
 
 _MODEL_POINTS: Final = 15_000  # of the cloud, which is recorded again at each step
-TRIANGLES: Final = 60_000
-"""Of a mesh as drawn, in a recording or on a page."""
+TRIANGLES: Final = 60_000  # of a mesh as drawn, in a recording or on a page
 _PLAIN: Final = (215, 215, 215)  # surface without colour
 
 

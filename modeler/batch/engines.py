@@ -25,8 +25,7 @@ from modeler.types import InputError
 
 T = TypeVar("T")
 
-JOB_BYTES = 3 << 29
-"""Memory of one build with its recording: most need half of it."""
+JOB_BYTES = 3 << 29  # memory of one build with its recording: most need half of it
 _QUEUED = 100  # jobs in a Slurm queue at a time, unless --workers is given
 _PATIENCE_S = 30  # for a scheduler to answer
 

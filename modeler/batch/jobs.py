@@ -24,14 +24,10 @@ from typing import Any, BinaryIO, Literal
 from modeler.system.processes import environment
 from modeler.system.regular_files import PIECE_BYTES
 
-BUILDER = "modeler.cli.one_job"
-"""Module that builds the sequence of a job, in a process of its own."""
-NOTES = ".batch"
-"""Subfolder of a batch with the state of each sequence and the output of its build."""
-TRIES = 2
-"""How often a sequence that fails is tried."""
-ENDED = (0, 3)
-"""Statuses of completed builds."""
+BUILDER = "modeler.cli.one_job"  # module that builds the sequence of a job, in a process of its own
+NOTES = ".batch"  # subfolder of a batch with the state of each sequence and the output of its build
+TRIES = 2  # how often a sequence that fails is tried
+ENDED = (0, 3)  # statuses of completed builds
 Standing = Literal["new", "interrupted", "done", "changed", "other", "failed"]
 _NOTE_BYTES = 1 << 24  # of a note at most
 _MOST = 1 << 31  # of a number in it
@@ -239,8 +235,7 @@ class Processes:
                 process.kill()  # a build that is killed loses the pair under way, and nothing else
 
 
-PROCESSES = Processes()
-"""Those of this process: engines run jobs in threads of it, or elsewhere."""
+PROCESSES = Processes()  # those of this process: engines run jobs in threads of it, or elsewhere
 
 
 def run(job: Job) -> Ended | None:

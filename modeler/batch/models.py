@@ -13,10 +13,8 @@ from modeler.export import RunFolder, mesh_of, poses_of, read_model, write_atomi
 from modeler.export.models_table import finite, fits, model_columns, report_columns, write_table
 from modeler.types import Array, InputError
 
-TABLE = "models.parquet"
-"""The list, in the folder of a batch."""
-THUMBNAIL_PX = 160
-"""Side of a picture of a model."""
+TABLE = "models.parquet"  # the list, in the folder of a batch
+THUMBNAIL_PX = 160  # side of a picture of a model
 
 
 def record_of(run: Path) -> dict[str, Any]:

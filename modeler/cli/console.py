@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, by the convention of shells."""
+INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
 _AGAIN_S = 0.05  # until a signal is sent again that arrived where nothing can be raised
 _PAIRS_TIMED = 3  # until it is said how long all takes
 _WHOLE = 2.6  # a build takes so many times its pass over the frames: 2.4 for the bundled box, 2.75 for the capture cap

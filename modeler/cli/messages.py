@@ -46,8 +46,7 @@ class Messages:
         return level >= self.least
 
 
-MESSAGES: Final = Messages()
-"""Of this process, for the command that runs."""
+MESSAGES: Final = Messages()  # of this process, for the command that runs
 
 
 def split(arguments: Sequence[str]) -> tuple[Messages, list[str]]:

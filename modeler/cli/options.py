@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from modeler.sequences import Overrides
 
 
-MIN_VOXEL_M = 1e-5
-"""No camera resolves less; a model of such voxels fits into no memory."""
+MIN_VOXEL_M = 1e-5  # no camera resolves less; a model of such voxels fits into no memory
 
 
 @dataclass(frozen=True)

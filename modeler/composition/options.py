@@ -133,8 +133,7 @@ class PriorOptions:
 
 
 Method = Literal["visibility", "paper", "icp", "gicp", "coloured-icp", "fpfh", "fpfh-icp", "kiss"]
-OF_EXTRAS: Final[tuple[Method, ...]] = ("kiss",)
-"""Methods that need an extra; they run only if named."""
+OF_EXTRAS: Final[tuple[Method, ...]] = ("kiss",)  # methods that need an extra; they run only if named
 
 
 @dataclass(frozen=True)

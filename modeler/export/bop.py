@@ -20,8 +20,7 @@ from modeler.system.pictures import raycaster, tensor
 from modeler.system.regular_files import read_json
 from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel
 
-MODELS_INFO = "models_info.json"
-"""BOP's list of models, in their folder."""
+MODELS_INFO = "models_info.json"  # BOP's list of models, in their folder
 
 
 def write_bop(model: ObjectModel, out: Path, place: Placement, more: Mapping[str, Any] | None = None) -> None:

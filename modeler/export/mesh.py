@@ -25,12 +25,9 @@ AS_GIVEN: Final = np.diag([1.0, -1.0, -1.0])
 """For a mesh whose y axis is already up: reverses the rotation to glTF's axes."""
 
 Tint = Literal["views", "sigma"]
-MADE_UP_RGB: Final = (230, 90, 200)
-"""Of unobserved, interpolated surface, wherever it is shown."""
-MOST_VIEWS: Final = 12
-"""Views at the end of the scale."""
-MOST_SIGMA_M: Final = 2e-3
-"""Standard deviation at the end of the scale."""
+MADE_UP_RGB: Final = (230, 90, 200)  # of unobserved, interpolated surface, wherever it is shown
+MOST_VIEWS: Final = 12  # views at the end of the scale
+MOST_SIGMA_M: Final = 2e-3  # standard deviation at the end of the scale
 
 _TRIES = (1.0, 0.98, 0.95, 0.9, 0.8)  # of what is asked for, until no edge of three triangles is left
 _SHARE = 0.5  # of vertices' sd by which triangles may be off: as an error of its own, it would add an eighth to the sd

@@ -23,8 +23,7 @@ from modeler.export.files import ply_bytes, write_atomically
 from modeler.system.pictures import encoded
 from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel
 
-MOST_POINTS: Final = 20_000
-"""Initial points; trainers add more where they need them."""
+MOST_POINTS: Final = 20_000  # initial points; trainers add more where they need them
 _PIXEL_CENTRE: Final = 0.5  # nerfstudio and COLMAP measure from the corner of the first pixel
 _OPENGL_AXES: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, z backward
 _PINHOLE: Final = 1  # COLMAP's number of the model without distortion

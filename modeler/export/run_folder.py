@@ -21,10 +21,8 @@ from modeler.types import InputError, Step
 _REPORT = "report.json"
 _OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
 """The report, without which nothing is resumed, goes first."""
-_PATHS = ("sequence", "sensor", "camera")
-"""Entries of a report and of its settings that are paths."""
-PAGE = "report.html"
-"""Page of `modeler report`; removed together with the run."""
+_PATHS = ("sequence", "sensor", "camera")  # entries of a report and of its settings that are paths
+PAGE = "report.html"  # page of `modeler report`; removed together with the run
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,10 @@ from modeler.export.mesh import simplified
 from modeler.system.processes import install_command
 from modeler.types import Array, InputError, ObjectModel
 
-HULL_TRIANGLES = 500
-"""Most triangles of a convex part; a ball then loses 3 % of its volume."""
+HULL_TRIANGLES = 500  # most triangles of a convex part; a ball then loses 3 % of its volume
 # For CoACD: of a bear of 0.13 m, 1500 triangles became 15 parts with 5 % more volume in 9 s on two busy cores; with its
 # own settings and 8000 triangles, 70 parts in five minutes.
-PART_TRIANGLES = 1_500
-"""Triangles of the mesh from which convex parts are found."""
+PART_TRIANGLES = 1_500  # triangles of the mesh from which convex parts are found
 _CONCAVITY = 0.08  # the threshold of CoACD: how concave a part may stay
 _SEARCH: Mapping[str, Any] = {"resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
 _LEAST_AREA_M2 = 1e-12  # of a triangle: (1 µm)², below the resolution of a 32-bit file at a distance of 10 m
@@ -156,8 +154,7 @@ def bottom_area_m2(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> float
 
 FRICTION: Final = (0.8, 0.005, 0.0001)
 """Sliding, torsional (m) and rolling (m): of wood or cardboard on a table; MuJoCo's defaults but for the first."""
-MOST_TRIANGLES: Final = 200_000
-"""MuJoCo refuses meshes with more."""
+MOST_TRIANGLES: Final = 200_000  # MuJoCo refuses meshes with more
 _DROP_M = 1e-3  # height above the ground at which the object starts in the scene
 
 

@@ -24,8 +24,7 @@ from modeler.graph.pose_graph import Factor, inverse_right_jacobian
 from modeler.priors.common_axis import MIN_TURN_RAD
 from modeler.types import Array, segments
 
-Rows = Mapping[int, Array]
-"""By variable, blocks (m, 6) of whitened rows."""
+Rows = Mapping[int, Array]  # by variable, blocks (m, 6) of whitened rows
 _SLIP = [0, 1, 3, 4, 5]  # components of ξ other than the rotation about the axis
 _AXIS = gtsam.symbol("a", 0)  # beyond all frame numbers
 # Standard deviations of A about its initial estimate, rad and m. The rotation about the axis is not observable and is

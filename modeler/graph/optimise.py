@@ -26,8 +26,7 @@ _WILDFIRE = 1e-5  # changes in rad and m below which iSAM2 stops back substituti
 MAX_ROUNDS = 8  # of whatever iterates over solutions; if more are needed, the initial value was too far off
 _QUORUM = 3  # loops that agree with each other before as many new ones are tested against them alone
 
-Inlier = tuple[bool, ...]
-"""Whether each loop takes part, in their order."""
+Inlier = tuple[bool, ...]  # whether each loop takes part, in their order
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,7 @@ import numpy as np
 from modeler import se3
 from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, Posterior, are_separate, pooled
 
-ROOT_SIGMA = 1e-9
-"""Standard deviation of the root's pose in rad and m: practically zero, but positive definite."""
+ROOT_SIGMA = 1e-9  # standard deviation of the root's pose in rad and m: practically zero, but positive definite
 _KINDS: tuple[EdgeKind, ...] = ("odometry", "span", "closure", "join")  # in order of preference for the tree
 
 

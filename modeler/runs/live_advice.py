@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from modeler.suggestion import Belief, Suggestions
     from modeler.types import Step
 
-Receiver = Callable[["Step", "Belief", "Suggestions"], None]
-"""Receives the belief and the suggestions after a step."""
+Receiver = Callable[["Step", "Belief", "Suggestions"], None]  # receives the belief and the suggestions after a step
 
 
 @contextmanager

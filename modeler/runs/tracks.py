@@ -17,10 +17,8 @@ from modeler.system.regular_files import left_behind
 from modeler.tracking import Tracked
 from modeler.types import InputError, PoseGaussian
 
-POSES: Final = "poses.json"
-"""The file by which a folder is known."""
-PAGE: Final = "report.html"
-"""The page about a track."""
+POSES: Final = "poses.json"  # the file by which a folder is known
+PAGE: Final = "report.html"  # the page about a track
 FILES: Final = (POSES, "trajectory.txt", "bop.csv", "recording.rrd", PAGE)
 
 

@@ -29,8 +29,7 @@ from modeler.types import Array, BoolArray, Camera, Frame, InputError, Outcome, 
 from modeler.verdict.evidence import TOLERANCE
 from modeler.views import Sensor
 
-IDLE_S: Final = 600.0
-"""A person who turns an object by hand, and is called away, takes so long at most."""
+IDLE_S: Final = 600.0  # a person who turns an object by hand, and is called away, takes so long at most
 _LEARNT_FROM: Final = 12  # frames; the segmenter asks for about a dozen
 _SENSOR: Final = Sensor(SensorNoise(sigma_r_m=None))  # noise of an unknown camera: a share of the distance
 _END_PX: Final = (5, 250)  # colours beyond are black or saturated, whatever was there

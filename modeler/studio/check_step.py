@@ -45,8 +45,7 @@ _EXPORTS: Final = {
     "nerfstudio": "nerfstudio: images, masks, cameras",
     "colmap": "COLMAP: images, masks, cameras",
 }
-_OF_CHECK: Final = ("edit", "report", "calibrate-camera", "suggest")
-"""Commands of the check."""
+_OF_CHECK: Final = ("edit", "report", "calibrate-camera", "suggest")  # commands of the check
 _CAMERA: Final = {
     "Calibrate the camera, build again": None,
     "The focal length is right": "focal-length",

@@ -19,8 +19,7 @@ from typing import Any, Final
 
 from modeler.export import write_atomically
 
-POLL_S: Final = 0.25
-"""Between looks at what runs: words and bars need to be no fresher."""
+POLL_S: Final = 0.25  # between looks at what runs: words and bars need to be no fresher
 _LINE: Final = re.compile(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d) (\w+): (.*)")
 _FRAME: Final = re.compile(r"frames? \d+(?: to (\d+))?(?:: (\d+ joined.*);| (?:is|are) left out)")
 _COUNT: Final = re.compile(r"registering more pairs: (\d+) of (\d+)")

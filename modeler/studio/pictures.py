@@ -15,8 +15,7 @@ from modeler.types import BoolArray, Frame
 from modeler.viz.entities import OUTLINE_RGB
 from modeler.viz.images import outline
 
-THUMBNAIL_PX: Final = 80
-"""Height of a small picture."""
+THUMBNAIL_PX: Final = 80  # height of a small picture
 _JPEG_QUALITY: Final = 85  # edges of masks are then free of visible blocks
 
 

@@ -29,12 +29,10 @@ from modeler.system.pictures import encoded
 from modeler.system.regular_files import read_regular
 from modeler.types import BoolArray, Camera, InputError, Outcome, Segmentation
 
-STATE: Final = "scan.json"
-"""File of a scan's choices, by which its folder is known."""
+STATE: Final = "scan.json"  # file of a scan's choices, by which its folder is known
 _BOXES: Final = (0.25, 0.4, 0.6, 0.85)  # sides of the boxes tried around a click, as shares of the image's
 _RUN: Final = re.compile(r"run-(\d+)")
-MESHES: Final = tuple(suffix.removeprefix(".") for suffix in FORMATS)
-"""Kinds of mesh files."""
+MESHES: Final = tuple(suffix.removeprefix(".") for suffix in FORMATS)  # kinds of mesh files
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 
-MOST_BYTES: Final = 1 << 20
-"""Of a request or a message: strokes and choices have a few kilobytes."""
+MOST_BYTES: Final = 1 << 20  # of a request or a message: strokes and choices have a few kilobytes
 _POLICY: Final = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; object-src 'none'; base-uri 'self'; "

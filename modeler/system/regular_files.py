@@ -16,10 +16,8 @@ from typing import Any, BinaryIO
 
 from modeler.types import InputError
 
-MAX_BYTES = 1 << 30
-"""Larger files are not read into memory at once, nor unpacked to more."""
-PIECE_BYTES = 1 << 20
-"""Read at a time of larger ones: far above a system call's cost, and no burden for memory."""
+MAX_BYTES = 1 << 30  # larger files are not read into memory at once, nor unpacked to more
+PIECE_BYTES = 1 << 20  # read at a time of larger ones: far above a system call's cost, and no burden for memory
 _KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a FIFO",

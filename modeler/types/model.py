@@ -220,5 +220,4 @@ class Fusing:
     """The final model is being made."""
 
 
-Event = Step | Searching | Refining | Fusing
-"""An event of a run."""
+Event = Step | Searching | Refining | Fusing  # an event of a run

@@ -8,8 +8,7 @@ from typing import Final, TypeAlias
 
 from modeler.types.base import Outcome
 
-ACCEPTED: Final = "accepted"
-"""Outcome in a report of a frame that is part of the model."""
+ACCEPTED: Final = "accepted"  # outcome in a report of a frame that is part of the model
 
 
 @dataclass(frozen=True)

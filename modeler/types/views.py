@@ -70,8 +70,7 @@ class Camera:
         return np.broadcast_to(w, (self.height, self.width)), np.broadcast_to(h[:, None], (self.height, self.width))
 
 
-Intrinsics = Camera | npt.ArrayLike
-"""A camera, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix."""
+Intrinsics = Camera | npt.ArrayLike  # a camera, `(fx, fy, cx, cy)` in px, or the (3, 3) camera matrix
 
 
 @checked
@@ -216,8 +215,7 @@ Fitted with the pose to the pairs of three captures: 0.44 by column and 0.26 px 
 """
 
 
-NOMINAL_FOCAL = 0.02
-"""Default standard deviation of the logarithm of a focal length: typical manufacturing tolerance."""
+NOMINAL_FOCAL = 0.02  # default standard deviation of the logarithm of a focal length: typical manufacturing tolerance
 CALIBRATED_FOCAL = 0.005
 """The same where the camera was calibrated: by its maker, or by a program that wrote a file of its lens.
 

@@ -17,8 +17,7 @@ from modeler.sequences.meshes import IntArray, Mesh
 from modeler.system.pictures import linear_light
 from modeler.types import Array, BoolArray, Float32Array, InputError
 
-STEEP = np.sqrt(0.5)
-"""Surface tilted from upright by more than 45 degrees counts as facing up or down."""
+STEEP = np.sqrt(0.5)  # surface tilted from upright by more than 45 degrees counts as facing up or down
 
 
 @final
@@ -208,10 +207,8 @@ def _middle(mesh: Mesh) -> Array:
 
 Rgb = npt.NDArray[np.uint8]
 
-_FINE = 2
-"""Number of pixels per texel along each side when prints are drawn."""
-LARGEST_PX = 4096
-"""Images are at most this wide and high."""
+_FINE = 2  # number of pixels per texel along each side when prints are drawn
+LARGEST_PX = 4096  # images are at most this wide and high
 
 
 def gamma_coded(light: Array) -> Array:

@@ -114,8 +114,7 @@ def _welded(vertices: Array, triangles: IntArray) -> Mesh:
     return Mesh.single(vertices[first], triangles[distinct])
 
 
-ROUNDNESS_M = 15e-6
-"""Largest distance of facets of round shapes from the true surface in m."""
+ROUNDNESS_M = 15e-6  # largest distance of facets of round shapes from the true surface in m
 
 _UNIT_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _CUBE_FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

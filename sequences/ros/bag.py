@@ -119,8 +119,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 
-MAX_RATIO = 100
-"""Largest compression ratio of larger files: depth images never reach it."""
+MAX_RATIO = 100  # largest compression ratio of larger files: depth images never reach it
 _ZSTD = b"\x28\xb5\x2f\xfd"  # magic bytes of its files
 
 

@@ -186,10 +186,8 @@ def _rows(message: Any, bytes_a_pixel: int, where: str) -> npt.NDArray[np.uint8]
 
 
 STATIC = "tf2_msgs/msg/TFMessage"
-FARTHEST_M = 1e4
-"""No robot is larger."""
-MOST = 1000
-"""Messages of fixed transforms that are read; drivers send one or a few."""
+FARTHEST_M = 1e4  # no robot is larger
+MOST = 1000  # messages of fixed transforms that are read; drivers send one or a few
 
 
 def static_transform(bag: Bag, target: str, source: str) -> Array | None:
@@ -232,8 +230,7 @@ def _name(frame_id: str) -> str:
     return str(frame_id).removeprefix("/")
 
 
-FARTHEST_CAMERA_M = 10.0
-"""Largest distance of two cameras of one device."""
+FARTHEST_CAMERA_M = 10.0  # largest distance of two cameras of one device
 TEXT = "std_msgs/msg/String"
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
 

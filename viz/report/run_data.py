@@ -75,8 +75,7 @@ class Result:
         return self.truth[edge.target] @ se3.inverse(self.truth[edge.source])
 
 
-Row = Mapping[str, Any]
-"""Values of an entity by component."""
+Row = Mapping[str, Any]  # values of an entity by component
 
 
 _MAX_BYTES = 4 << 30  # Rerun reads the whole file into memory; 5,000 frames of 640×480 are as many
