@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,7 +45,6 @@ from modeler.viz.stream import open_stream
 Sink = Callable[[Event], object]  # consumes the events of a run: a `Step` for each frame, and others in between
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Result:
     """Result of a run."""

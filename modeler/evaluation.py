@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -156,7 +155,6 @@ SAMPLES = 50_000  # points drawn on a surface
 _REACHED = 1.0 - 1e-5  # share of the way to a point after which nothing hides it but itself
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class SurfaceErrors:
     """Distances between a reconstructed and a true surface."""
@@ -195,7 +193,6 @@ class SurfaceErrors:
         return replace(self, to_reconstruction_m=self.to_reconstruction_m[chosen])
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class TrueSurface:
     """A true surface."""

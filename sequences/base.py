@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Self, final
+from typing import Final, Self
 
 from modeler.types import Array, Frame, InputError, SensorNoise
 
@@ -209,7 +209,6 @@ class AbstractLive(AbstractSequence):
         return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
 
 
-@final
 @dataclass(frozen=True)
 class SelectedSequence(AbstractDerived):
     """Some frames of another sequence."""
@@ -233,7 +232,6 @@ class SelectedSequence(AbstractDerived):
         return None if truth is None else {index: truth[index] for index in self.kept if index in truth} or None
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class GivenSequence(AbstractSequence):
     """Frames that a program gives: those that it has given, and, from a live source, those to come."""
@@ -293,7 +291,6 @@ def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
         yield frame
 
 
-@final
 @dataclass(frozen=True)
 class KeptSequence(AbstractDerived):
     """Another sequence, of which frames stay in memory once they were read: to decode them takes milliseconds each.

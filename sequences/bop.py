@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -78,7 +77,6 @@ MASKS = "mask_visib"  # folder of the masks
 OCCLUDERS = "mask_hand"  # folder of the masks of occluders: a hand, a gripper
 
 
-@final
 @dataclass(frozen=True)
 class BopSequence(AbstractRecording):
     """A BOP scene folder, the onboarding layouts among them.

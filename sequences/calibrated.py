@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
-from typing import Final, Literal, final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from modeler.types import NOMINAL_FOCAL, Array, Camera, Frame, InputError, Senso
 MAX_ANGLE_RAD = np.radians(85.0)  # beyond, the model's noise would grow without bounds and is kept constant
 
 
-@final
 @dataclass(frozen=True)
 class NoiseModel:
     """Noise across and along the ray.
@@ -105,7 +104,6 @@ def object_distance_m(frame: Frame) -> float:
     return float(np.percentile(frame.depth_m[inside], share)) if inside.any() else 1.0
 
 
-@final
 @dataclass(frozen=True)
 class CalibratedSequence(AbstractDerived):
     """Another sequence, of a camera with this noise."""
@@ -135,7 +133,6 @@ def has_focal(frame: Frame, stated_px: float) -> bool:
     return abs(frame.camera.fx / stated_px - 1.0) <= 1e-3
 
 
-@final
 @dataclass(frozen=True)
 class FocalFactor:
     """The focal length and the depth scale of a camera, relative to those in its sequences."""
@@ -183,7 +180,6 @@ def read_focal_factor(path: Path) -> FocalFactor:
     )
 
 
-@final
 @dataclass(frozen=True)
 class RefocusedSequence(AbstractDerived):
     """Another sequence, whose camera has this focal length and depth scale."""
@@ -223,7 +219,6 @@ def stretch(camera: Camera) -> Array:
     return np.sqrt(1.0 + w**2 + h**2)
 
 
-@final
 @dataclass(frozen=True)
 class AxialSequence(AbstractDerived):
     """Another sequence, whose depth is the distance along the ray, with depth along the optical axis."""

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Final, Literal, final
+from typing import BinaryIO, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +33,6 @@ _MOST_BYTES = 1000  # a point, as text with many fields
 _LZF_RATIO = 20  # points a byte: its longest match is 264 bytes in 3, and a point has 6 at the least
 
 
-@final
 @dataclass(frozen=True)
 class CloudSequence(AbstractRecording):
     """A cloud a frame, in camera coordinates."""
@@ -173,7 +172,6 @@ def _unit_mm(cloud: _Cloud, overrides: Overrides) -> tuple[float, str]:
     return (1.0, "by the size of the coordinates") if in_mm else (1000.0, "the coordinates")
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Cloud:
     """A cloud as stored."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,6 @@ _EDGE: Final = 0.03  # relative second difference of inverse depth, which is lin
 _LEAST_EDGES: Final = 12.0  # px at that size, mean over the frames
 
 
-@final
 @dataclass(frozen=True)
 class Misalignment:
     """Where edges of depth are found in colour, if not where they are."""
@@ -86,7 +85,6 @@ def misalignment(frames: Sequence[Frame]) -> Misalignment | None:
     return _result(frames[0], chosen, best, aligned / deviation)
 
 
-@final
 @dataclass(frozen=True)
 class _Peak:
     """The best shift of one flip and scale."""
@@ -158,7 +156,6 @@ def _shrunk(image: Array, step: int) -> Array:
     return image[: height * step, : width * step].reshape(height, step, width, step).mean(axis=(1, 3))
 
 
-@final
 class _Search:
     """Correlation of edges of depth and colour over shifts, summed over frames."""
 

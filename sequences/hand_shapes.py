@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from modeler.types import Array, BoolArray, Frame, HandPoses, InputError
 _MOST = 100  # capsules: 10 s a run of 100 frames
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class HandShape:
     """A hand as capsules: all points within a radius of a line segment."""
@@ -76,7 +74,6 @@ def _ray_distances(rays: Array, start_m: Array, end_m: Array) -> Array:
     return np.where(np.sum(nearest_m * rays, axis=1) > 0.0, distances_m, np.inf)
 
 
-@final
 @dataclass(frozen=True)
 class HandMarkedSequence(AbstractDerived):
     """Another sequence whose frames have a robot's hand masked, in addition to their own masks."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -63,7 +63,6 @@ def can_decode() -> bool:
     return importlib.util.find_spec("av") is not None
 
 
-@final
 class Video:
     """A video whose images are read one after the other: to go back is to begin again."""
 
@@ -98,7 +97,6 @@ class Video:
         return container
 
 
-@final
 @dataclass(frozen=True, slots=True)
 class FrameFiles:
     """Files of one frame."""
@@ -118,7 +116,6 @@ class FrameFiles:
     """fx, fy, cx, cy in px of this frame; None: those of the sequence."""
 
 
-@final
 @dataclass(frozen=True)
 class ImageFolderSequence(AbstractRecording):
     """Image files of one camera."""
@@ -217,7 +214,6 @@ POSES = "annotated_poses"
 FARTHEST_M = 1e6  # largest plausible coordinate of a camera in m
 
 
-@final
 @dataclass(frozen=True)
 class FoundImages:
     """Images of a folder by role and name, in order of their names."""

@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import final
 
 import numpy as np
 
@@ -120,7 +119,6 @@ MAX_BYTES = 64_000_000  # larger text is refused
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
-@final
 @dataclass(frozen=True)
 class Node:
     """One value of a file, and its place in the file.

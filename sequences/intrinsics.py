@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
 
 import numpy as np
 
@@ -80,7 +79,6 @@ OF_COLOUR = (*OF_PHONES, "transforms.json")  # intrinsics of colour images, whos
 _PHONE_SIZE = (1920, 1440)  # images of Stray Scanner, whose file does not state their size
 
 
-@final
 @dataclass(frozen=True)
 class CameraFacts:
     """The camera of a folder of images."""

@@ -9,7 +9,7 @@ import weakref
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -99,7 +99,6 @@ ADVICE = install_command("kinect")
 _AGAIN = "record or copy it again"
 
 
-@final
 @dataclass(frozen=True)
 class KinectSequence(AbstractStreams[int]):
     """The depth track of a recording, and colour brought to its pixels. Images are found by their time stamps."""
@@ -171,7 +170,6 @@ def _check_whole(path: Path) -> None:
         raise InputError(f"{path}: ends in {hole_bytes / 1e9:.0f} GB that were never written; record or copy it again.")
 
 
-@final
 @dataclass(frozen=True)
 class Matroska:
     """A recording that is open while it is used."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar, final
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,6 @@ from modeler.types import Array, Camera, InputError
 Pixel = TypeVar("Pixel", np.bool_, np.uint8, np.uint16, np.float32)
 
 
-@final
 @dataclass(frozen=True)
 class Lens:
     """A camera with radial and tangential distortion, with the coefficients of ROS, OpenCV and the Kinect.
@@ -118,7 +117,6 @@ NEIGHBOUR_M = 0.02  # occluded pixels take the colour of the nearest visible sur
 STRIDE = 3  # stride over the visible points in that search
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """Two cameras that are fixed to each other."""

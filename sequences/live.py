@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import timedelta
-from typing import Any, Final, final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,6 @@ Image = tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]
 """Time in s, raw depth (h, w), and colour (h, w, 3) of the depth camera's pixels, if there is any."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class RunningCamera:
     """A camera that a library runs."""
@@ -63,7 +62,6 @@ def in_a_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-@final
 @dataclass(frozen=True)
 class LiveSequence(AbstractLive):
     """Images of a running camera, taken on demand until `stop()` is true."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +17,6 @@ from modeler.types import Array, InputError
 IntArray = npt.NDArray[np.int64]
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles of one or several closed parts, which may overlap and stand for their union."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 from scipy.ndimage import binary_dilation, correlate
@@ -24,7 +23,6 @@ STEEPEST = 1.5
 WINDOW = 9  # rows over which a border is compared with a smooth curve
 
 
-@final
 @dataclass(frozen=True)
 class DepthEdge:
     """A depth discontinuity across a number of rows (or columns)."""
@@ -144,7 +142,6 @@ MIN_PIXELS = 200  # classes with fewer pixels say nothing
 STEEPEST_RAD = np.radians(80.0)  # steeper surfaces are not measured: the quadric spans too much of them
 
 
-@final
 @dataclass(frozen=True)
 class NoiseBin:
     """Pixels of about one distance and angle."""
@@ -253,7 +250,6 @@ MOST_FRAMES = 40  # more frames of a still scene add little
 MAX_MOVING = 0.02  # share of the pixels that may change by more than noise
 
 
-@final
 @dataclass(frozen=True)
 class Calibration:
     """Noise of a camera measured in a static scene."""

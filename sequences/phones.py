@@ -8,7 +8,7 @@ import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,6 @@ ADVICE = install_command("phones")
 _AGAIN = "export it again"
 
 
-@final
 @dataclass(frozen=True)
 class Record3DSequence(AbstractRecording):
     """An archive `.r3d`: depth in m, packed by LZFSE, with its confidence, and JPEG colour of the same view."""

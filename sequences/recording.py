@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Final, Generic, TypeVar, final
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -160,7 +160,6 @@ MAX_APART_S = 0.02
 """Depth and colour farther apart in time than this are no pair (the TUM benchmark's own tool has the same)."""
 
 
-@final
 @dataclass(frozen=True)
 class ImagePair(Generic[Stamp]):
     """A depth image, and the colour image that was taken with it."""

@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +47,6 @@ LEAST_JOINED = 0.3
 MOST_NOISE = 0.008  # scatter as a share of depth. A Kinect 1 at 3 m, the noisiest camera measured, has 0.4 %.
 
 
-@final
 @dataclass(frozen=True)
 class Survey:
     """Contents of the frames of a sequence."""

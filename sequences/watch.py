@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 from modeler.sequences.base import FIRST, AbstractDerived, AbstractLive, AbstractSequence
 from modeler.sequences.intrinsics import Overrides
@@ -25,7 +25,6 @@ REST = 3.0
 """So many times as long as looking took is rested at least: of 10,000 frames it takes 10 ms, with new ones 0.1 s."""
 
 
-@final
 @dataclass(frozen=True)
 class WatchLimits:
     """Time limits of watching a folder."""
@@ -38,7 +37,6 @@ class WatchLimits:
     """Number of frames to wait for before the sequence is described."""
 
 
-@final
 @dataclass(frozen=True)
 class WatchedSequence(AbstractLive, AbstractDerived):
     """The frames in a folder, and those that will come, each once it is complete.
@@ -169,7 +167,6 @@ class _Failing(NamedTuple):
     """Why; not the error itself, which holds the images that were read before it."""
 
 
-@final
 class _Looks:
     """Looks at a folder and at the folders in it, which cost no more than the names of files that are complete."""
 

@@ -94,3 +94,9 @@ def test_public_methods_have_a_docstring_or_override_one_that_has() -> None:
         if isinstance(method, ast.FunctionDef) and not (name + method.name).startswith("_")
         if not method.name.startswith("_") and method.name not in documented(name)
     ] == []
+
+
+def test_classes_are_abstract_or_final() -> None:
+    classes = [node for path in SOURCES for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef)]
+    bases = {re.sub(r"\[.*", "", ast.unparse(base)) for node in classes for base in node.bases}
+    assert bases & {node.name for node in classes if not node.name.startswith("Abstract")} == {"InputError"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from scipy import stats
@@ -112,7 +112,6 @@ _AXIS_COLOUR: Final = "#9aa3ad"
 _CONTROL_COLOUR: Final = "#b8474a"
 
 
-@final
 @dataclass(frozen=True)
 class Curve:
     """Squared errors in units of the estimated covariances."""
@@ -127,7 +126,6 @@ class Curve:
     """Style: its own colour, a thin line behind, or dashed."""
 
 
-@final
 @dataclass(frozen=True)
 class Panel:
     """The curves of one plot."""

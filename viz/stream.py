@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Any, Final
 
 from modeler.system.processes import check_room
 from modeler.system.regular_files import PIECE_BYTES, create_regular
@@ -36,7 +36,6 @@ _QUEUED: Final = 100  # steps that viewers are behind at most, besides those tha
 _BEGINNING: Final = 4096  # bytes that must fit on the disk to begin with
 
 
-@final
 class RecordingFile:
     """A file that Rerun writes through a pipe: Rerun 0.41 waits for ever at the end of a file that it could not write.
 
@@ -120,7 +119,6 @@ class RecordingFile:
             return False
 
 
-@final
 class Shown:
     """What viewers are shown, sent from a thread of its own: Rerun 0.41 waits for a viewer that is 400 MB behind."""
 

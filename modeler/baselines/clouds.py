@@ -10,7 +10,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +36,6 @@ _OPEN_ROTATION_RAD = np.pi / 2  # root mean square beyond which a mean rotation 
 _MIN_SIGMA = 1e-6  # rad or m: keeps covariances positive definite if prior or residuals vanish
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """Surface points with normals, in one camera's coordinates."""
@@ -102,7 +100,6 @@ def cube_edges_m(source: Cloud, target: Cloud, shares: Sequence[float]) -> list[
     return list(dict.fromkeys(max(share * size_m, spacing_m) for share in shares))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Start:
     """The initial pose of a local search, with the prior's spread about it."""
@@ -151,7 +148,6 @@ def _rms_angle(pose: Array, samples: Array) -> float:
     return float(np.sqrt(np.mean(se3.rotation_angle(se3.inverse(pose) @ samples) ** 2)))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Matches:
     """Points of the source with their correspondences: the nearest points of the target under a motion."""
@@ -209,7 +205,6 @@ def residual_variance(squares: float, count: float) -> float:
     return max(squares / max(count - 6.0, 1.0), _MIN_SIGMA**2)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The result of a point cloud method."""

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +33,6 @@ _SAMPLE_SIZE = 3  # correspondences that determine a motion
 _BATCH = 2_000  # draws between evaluations of the stopping rule
 
 
-@final
 @dataclass(frozen=True)
 class FpfhRegistrar(AbstractCloudRegistrar):
     """RANSAC on matches of Fast Point Feature Histograms (Rusu et al. 2009).
@@ -140,7 +139,6 @@ def _draws_needed(agreement: float, confidence: float) -> float:
     return 0.0 if chance >= 1.0 else float(np.log1p(-confidence) / np.log1p(-chance)) if chance > 0.0 else np.inf
 
 
-@final
 @dataclass(frozen=True)
 class FpfhIcpRegistrar(AbstractCloudRegistrar):
     """FPFH with RANSAC, refined by point-to-plane ICP."""
@@ -165,7 +163,6 @@ def kiss_installed() -> bool:
     return importlib.util.find_spec("kiss_matcher") is not None
 
 
-@final
 @dataclass(frozen=True)
 class KissIcpRegistrar(AbstractCloudRegistrar):
     """KISS-Matcher (Lim et al., ICRA 2025), refined by point-to-plane ICP.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -41,7 +40,6 @@ class AbstractMultiscaleRegistrar(AbstractCloudRegistrar):
     """Largest number of steps per level."""
 
 
-@final
 @dataclass(frozen=True)
 class IcpRegistrar(AbstractMultiscaleRegistrar):
     """Multi-scale point-to-plane ICP (Chen and Medioni 1992).
@@ -70,7 +68,6 @@ class IcpRegistrar(AbstractMultiscaleRegistrar):
         return descended(source, pose, self.iterations, linearised)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Linearised:
     """A least-squares problem, linearised at a pose."""
@@ -142,7 +139,6 @@ def _tukey(ratios: Array) -> Array:
     return np.maximum(1.0 - ratios**2, 0.0) ** 2
 
 
-@final
 @dataclass(frozen=True)
 class GicpRegistrar(AbstractMultiscaleRegistrar):
     """GICP of small_gicp (Segal et al. 2009) from coarse to fine, with its Hessian.
@@ -196,7 +192,6 @@ class GicpRegistrar(AbstractMultiscaleRegistrar):
 _MIN_NEIGHBOURS = 4  # points, itself included, that determine the gradient of intensity at a point
 
 
-@final
 @dataclass(frozen=True)
 class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
     """Multi-scale ICP on distances to planes and differences of intensity (Park, Zhou and Koltun 2017).

@@ -16,7 +16,7 @@ from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecu
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock
-from typing import Any, TypeVar, final
+from typing import Any, TypeVar
 
 from modeler.batch.jobs import PROCESSES, TRIES, Ended, Job, read_note, run, write_failure
 from modeler.system.concurrency import cores
@@ -130,7 +130,6 @@ def _has_slurm() -> bool:
     return shutil.which("srun") is not None
 
 
-@final
 class SubmititExecutor(Executor):
     """Jobs of submitit as futures: a thread waits for each that is in the queue."""
 

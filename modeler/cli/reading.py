@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, final
+from typing import Protocol
 
 from modeler.cli.console import bar, say
 from modeler.sequences import AbstractSequence, Overrides, WatchLimits, watch
@@ -15,7 +15,6 @@ from modeler.sequences.base import AbstractDerived
 from modeler.types import Frame, InputError
 
 
-@final
 @dataclass(frozen=True)
 class ObservedSequence(AbstractDerived):
     """Another sequence, with a callback after each frame that is read."""

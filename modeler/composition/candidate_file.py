@@ -7,7 +7,6 @@ import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,7 +22,6 @@ _COLUMNS = ("name", "cost", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _MOST = 1000  # 25 s; a robot's list is shorter
 
 
-@final
 @dataclass(frozen=True)
 class Turn:
     """A turn about the table's normal."""
@@ -38,7 +36,6 @@ class Turn:
         return Candidate("turn", turn_deg=self.turn_deg, name=self.name, cost=self.cost)
 
 
-@final
 @dataclass(frozen=True)
 class Poke:
     """A push along the table, as `sequence.json` has them, in the coordinates of the last camera."""
@@ -55,7 +52,6 @@ class Poke:
         return Candidate("poke", poke=push, name=self.name, cost=self.cost)
 
 
-@final
 @dataclass(frozen=True)
 class Lay:
     """Laying the object on its side."""
@@ -68,7 +64,6 @@ class Lay:
         return Candidate("lay", name=self.name, cost=self.cost)
 
 
-@final
 @dataclass(frozen=True)
 class Pose:
     """A pose that a robot can bring the object, or the camera, to."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import NamedTuple, Protocol, TypeVar, final
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -70,7 +70,6 @@ class Pair(NamedTuple):
     """Frames from one to the other, in the order of the sequence."""
 
 
-@final
 @dataclass(frozen=True)
 class Pairing:
     """Which frames are registered with each other."""
@@ -99,7 +98,6 @@ class Pairing:
                         yield Pair(earlier, later, offset)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """Registers the same pairs by several methods."""
@@ -240,7 +238,6 @@ def sparse_view(view: RayImage, count: int, rng: np.random.Generator) -> RayImag
     )
 
 
-@final
 @dataclass(frozen=True)
 class Trial:
     """One pair registered by one method. What does not exist is NaN: a failed view has no error."""
@@ -315,7 +312,6 @@ class Quantiles(NamedTuple):
         return Quantiles(*(float(np.quantile(values, share)) if len(values) else math.nan for share in shares))
 
 
-@final
 @dataclass(frozen=True)
 class Summary:
     """The trials of one method on one sequence at one offset. Quantiles are over those that have an error."""

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal, final
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,6 @@ Poses = Literal["run", "true"]
 Over = Literal["seen", "whole"]
 
 
-@final
 @dataclass(frozen=True)
 class ModelScore:
     """How far one model is from the true surface."""
@@ -57,7 +56,6 @@ class ModelScore:
     """Their harmonic mean."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Modelled:
     """A run to be judged."""
@@ -76,7 +74,6 @@ class Modelled:
     """Vertices (v, 3) in m and triangles (t, 3) of the true surface."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Candidate:
     """One model to be compared with the truth."""

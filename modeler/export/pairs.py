@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -35,7 +35,6 @@ _GAUSSIAN = ("mean", "covariance", "by_focal")  # its arrays
 _digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several keys
 
 
-@final
 @dataclass(frozen=True)
 class Pairs:
     """A folder with one file per registration, so that a killed run need not repeat them.
@@ -105,7 +104,6 @@ class Pairs:
         return f"{source:06d}-{target:06d}-{key[0]}-{key[1]}.pair"
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PairCache(AbstractPairCache):
     """Returns stored registrations and stores others at once."""

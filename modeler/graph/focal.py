@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -179,7 +178,6 @@ Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
 _LIMIT_STEPS = 2.0  # steps for which limits hold, as where a run places a view that one step's do not
 
 
-@final
 @dataclass(frozen=True)
 class FocalCalibrator:
     """Estimates the focal length from the views and the edges of a run: that under which its loops close.

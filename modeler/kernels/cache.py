@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 import llvmlite
 import llvmlite.binding
@@ -70,7 +70,6 @@ def kept(module: str, name: str) -> bool:
     return any(_content(path) is not None for folder in _folders() for path in folder.glob(f"{module}.{name}-*"))
 
 
-@final
 class KernelCache(_Cache):
     """The files of one kernel, one for each signature, named by everything that the compiled code depends on."""
 

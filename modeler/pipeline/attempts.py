@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -49,7 +49,6 @@ _SEPARATE_RAD = 0.26  # registrations that differ by a larger rotation are two m
 _MIN_MODE_WEIGHT = 0.01
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Attempt:
     """One registration of a view against a view of the graph."""
@@ -68,7 +67,6 @@ class Attempt:
     """Which of two registrations of the pair counts: an earlier one, or this one."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Search:
     """What is known while a view is registered: the run so far, and the registrations of this view."""
@@ -364,7 +362,6 @@ Prefer = Callable[[Search, Posterior, Posterior], Posterior]
 Stage = Literal["track", "revisit", "fill", "close", "refine"]
 
 
-@final
 @dataclass(frozen=True)
 class Rung:
     """One or more attempts: the views, the prior of the motion to each, if what was found so far, counting which."""

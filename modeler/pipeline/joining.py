@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 from scipy.special import chdtri
@@ -53,7 +53,6 @@ MIN_JOINS: Final = 2
 """Pairs of views that must agree on an alignment: nothing confirms a single one."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Segment:
     """Views with their poses relative to each other."""
@@ -76,7 +75,6 @@ class Segment:
         return sorted(frame for frame in self.views if frame in self.solution.trajectory)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """A hypothesis about the relative pose of two segments."""
@@ -99,7 +97,6 @@ class Alignment:
         return sum(edge.accepted for edge in self.edges)
 
 
-@final
 @dataclass(frozen=True)
 class Joiner:
     """Joins segments: aligns their models, scores alignments by all views, and registers pairs of views."""

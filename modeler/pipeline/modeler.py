@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
 
 from modeler.closure import Closer
 from modeler.fusion import Fuser
@@ -34,7 +33,6 @@ from modeler.types import (
 from modeler.views import Sensor
 
 
-@final
 @checked
 @dataclass(frozen=True)
 class Modeler:

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TypeVar, final
+from typing import TypeVar
 
 from modeler.system.disk_arrays import ViewStore
 from modeler.types import Frame
@@ -14,7 +14,6 @@ from modeler.types import Frame
 T = TypeVar("T")
 
 
-@final
 @dataclass(eq=False)
 class NewestFrames:
     """Reads frames in a thread of its own, yields the newest each time, and keeps the frames skipped (`skipped`).

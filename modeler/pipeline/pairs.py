@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 
@@ -82,7 +82,6 @@ def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) ->
     return Prepared(frame, segmentation, view if len(view.points_m) else None)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Registrations:
     """Registers pairs of views, each with a random generator of its own."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
-from typing import final
 
 from modeler.pipeline.attempts import told_otherwise
 from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment, rejected_elsewhere
@@ -14,7 +13,6 @@ from modeler.types import Edge, Searching
 from modeler.verdict.evidence import FreeSpace, default_tolerance_m, free_space
 
 
-@final
 @dataclass(frozen=True)
 class Realigner:
     """Aligns two parts of a run anew while surface of one violates the other's free space (docs/method/segments.md).

@@ -6,7 +6,7 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, Final
 
 from modeler.closure import Placement
 from modeler.fusion import Preview, conditional_covariances, widened
@@ -51,7 +51,6 @@ _FOCAL_REACH: Final = 5.0  # prior standard deviations: nominal focal lengths of
 _MIN_SEGMENT: Final = 3  # frames that fit each other: two may do so by chance
 
 
-@final
 @dataclass(eq=False)
 class Run:
     """One run and the only owner of its state: seven phases in order, each a stream of events.

@@ -6,7 +6,6 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
-from typing import final
 
 from modeler.closure import Closer, Placement
 from modeler.pipeline.attempts import FULL, Attempt, Search, Stage
@@ -27,7 +26,6 @@ from modeler.types import (
 from modeler.views import Sensor
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Tracker:
     """Registers a new view against earlier ones, and views of the graph with each other."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -59,7 +58,6 @@ def kabsch(source_m: Array, target_m: Array) -> Array:
     return poses
 
 
-@final
 @dataclass(frozen=True)
 class FeatureMatcher:
     """Finds the motions between two views on which matches of their features agree (docs/method/search.md).
@@ -103,7 +101,6 @@ class FeatureMatcher:
         return motions[order], votes[order]
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Described:
     """Points of a thinned surface, and the features by which they are recognised."""

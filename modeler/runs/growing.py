@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 import numpy as np
 
@@ -55,7 +55,6 @@ class Grown:
     """Number of new frames."""
 
 
-@final
 @dataclass(frozen=True)
 class Growth:
     """Goes on building a model from a new recording."""

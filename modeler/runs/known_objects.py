@@ -6,7 +6,7 @@ import io
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from modeler.types import InputError, ObjectModel, checked
 Unit = Literal["m", "cm", "mm"]
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class KnownObject:
     """An object with its model."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar, final
+from typing import Any, TypeVar
 
 from modeler.composition import compose
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
@@ -33,7 +33,6 @@ _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
 _ALIKE = 0.02  # largest relative change of an object's number of points between versions of a library
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Part:
     """A run and its sequence."""

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 from modeler.export import tum_text, write_atomically
 from modeler.export.files import PART
@@ -22,7 +22,6 @@ PAGE: Final = "report.html"  # the page about a track
 FILES: Final = (POSES, "trajectory.txt", "bop.csv", "recording.rrd", PAGE)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class TrackFolder:
     """Where a track is written, at most a tenth of the time as it goes, and complete at the end."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,6 @@ _RAGGED_SHARE = 0.02  # share of the image by which the edge of a blind band may
 _SPECK_SHARE = 0.003  # share of a mask; smaller pieces are removed
 
 
-@final
 @dataclass(frozen=True)
 class DepthNoise:
     """Depth noise of a consumer camera: a floor, and a term that grows with the square of the depth.
@@ -59,7 +58,6 @@ class DepthNoise:
         return DepthNoise(self.floor_m, float(np.sqrt(max(whole_m**2 - self.floor_m**2, 0.0))) / depth_m**2)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Layers:
     """Background and foreground of several frames of a static camera, downsampled."""

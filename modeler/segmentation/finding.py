@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 from scipy import ndimage
@@ -38,7 +37,6 @@ _CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the
 AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Found:
     """The object in one frame."""
@@ -75,7 +73,6 @@ def find(
     return replace(chosen, mask=mask)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Part:
     """The part of a downsampled depth image whose depths the object may have."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast, final
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -150,7 +150,6 @@ def _warp(uv: Array, residual: Array, weight: Array) -> Array:
     return power * np.diag(np.append(1.0 / uv.var(axis=0), 1.0))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Cells:
     """The flat cells of an image."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +51,6 @@ _TOUCHING_PX = 3
 _ON_PLANE, _ABOVE, _BELOW = 0.1, 0.01, 0.2  # shares of the points: at least, at least, and at most for a support plane
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Scene learned from several frames. With an empty scene, each frame is segmented separately."""

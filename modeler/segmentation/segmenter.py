@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
 
 import numpy as np
 from scipy import ndimage
@@ -37,7 +36,6 @@ _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of a
 _Look = tuple[Frame, Found]
 
 
-@final
 @checked
 @dataclass(frozen=True)
 class Segmenter:

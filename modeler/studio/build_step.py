@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Any, Final
 
 from nicegui import run, ui
 
@@ -27,7 +27,6 @@ _STEP_DEG, _STEP_SIGMA_DEG = 20.0, 3.0  # where nothing is known: a usual step, 
 _QUESTION: Final = "How did it move?"
 
 
-@final
 class BuildStep:
     """The choice of the prior, and the embedded viewer."""
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +35,6 @@ _SENSOR: Final = Sensor(SensorNoise(sigma_r_m=None))  # noise of an unknown came
 _END_PX: Final = (5, 250)  # colours beyond are black or saturated, whatever was there
 
 
-@final
 class Capture:
     """Follows a folder from a thread of its own until the build that reads it ends."""
 
@@ -162,7 +161,6 @@ class Capture:
         self._too_far = too_far(view) if len(view.points_m) else ""
 
 
-@final
 class Recorder:
     """Takes the images of a camera from a thread of its own, and writes those that are wanted into a folder."""
 

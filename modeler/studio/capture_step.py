@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, Final
 
 from nicegui import run, ui
 
@@ -49,7 +49,6 @@ window.tone = (hertz) => {
 """Script that plays a note."""
 
 
-@final
 class CaptureStep:
     """Following a capture."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
 from nicegui import run, ui
@@ -54,7 +54,6 @@ _CAMERA: Final = {
 """What `calibrate-camera` is told to be known, by the words of its button."""
 
 
-@final
 class CheckStep:
     """The verdict on the latest run."""
 
@@ -163,7 +162,6 @@ def _verdict(report: Mapping[str, Any]) -> None:
             ui.label(sentence(reason))
 
 
-@final
 class ExportStep:
     """What is taken away."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
 from nicegui import run, ui
@@ -22,7 +22,6 @@ _RECORDINGS: Final = (*BAGS, *SUFFIXES, ".mkv", ".r3d")
 _SHOWN: Final = 200  # entries of a folder
 
 
-@final
 class FilesStep:
     """Choosing a capture."""
 
@@ -67,7 +66,6 @@ class FilesStep:
         self.page.start()
 
 
-@final
 class ScansStep:
     """The gallery."""
 

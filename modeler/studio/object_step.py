@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
 from nicegui import events, run, ui
@@ -25,7 +25,6 @@ _THUMBNAILS: Final = 300  # frames shown small; of longer captures every so many
 _NAMED: Final = 12  # doubtful frames
 
 
-@final
 class ObjectStep:
     """The frames with the outline of the object, and what corrects it."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, Final
 
 from nicegui import events, run, ui
 
@@ -29,7 +29,6 @@ _STYLE: Final = Path(__file__).with_name("style.css")
 _DARK: Final = "background: #10343b"
 
 
-@final
 class Page:
     """What one browser window shows."""
 

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 import numpy as np
 from PIL import Image
@@ -85,7 +85,6 @@ class Choices:
         return words + ([] if self.camera is None else ["--camera", self.camera])
 
 
-@final
 class Scan:
     """A capture being made into a model. Methods may be called from any thread."""
 

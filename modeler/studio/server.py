@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import parse_qs, quote
 from urllib.request import urlopen
 
@@ -59,7 +59,6 @@ _CONFLICT: Final = 4403  # code of a refused web socket
 _SAFE: Final = ("GET", "HEAD")
 
 
-@final
 @dataclass(frozen=True)
 class Guard:
     """An application around another one, which sees only requests that may be answered."""
@@ -141,7 +140,6 @@ async def _refuse(scope: Scope, send: Send, status: HTTPStatus) -> None:
     await send({"type": "http.response.body", "body": words})
 
 
-@final
 class _Limited:
     """The body of a request, cut off where it becomes too large: its length need not be stated."""
 
@@ -177,7 +175,6 @@ _VIEWER_FILE: Final = re.compile(r"[\w.-]{0,64}")
 _ELSEWHERE: Final = re.compile(rb"<link[^>]*https://[^>]*>")
 
 
-@final
 @dataclass
 class Viewers:
     """The Rerun viewer that pages embed: of the build that runs, or of a finished run."""
@@ -264,7 +261,6 @@ def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
         viewers.stop()
 
 
-@final
 class _Server(uvicorn.Server):
     """One that says when it answers, and ends in order also if it is asked to while it starts."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import final
 
 from modeler.sequences import open_sequence
 from modeler.studio.capture import IDLE_S, Capture, Recorder
@@ -14,7 +13,6 @@ from modeler.studio.scan import STATE, Choices, Scan, next_run, page_job
 from modeler.types import InputError
 
 
-@final
 class Studio:
     """All scans of a folder, and the commands that run: what every page shows."""
 

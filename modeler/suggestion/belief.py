@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 
@@ -41,7 +41,6 @@ _LEAST_MASS: Final = 0.03  # of a bin of turns that is evaluated
 _SPAN_STEPS: Final = 4  # number of steps whose prior limits apply to closures
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """The predicted effect of an action."""
@@ -79,7 +78,6 @@ class Prediction:
         return (2.0 * self.right - 1.0) * (self.pose_nats + self.surface_nats)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Shown:
     """The part of the object visible in a view."""
@@ -90,7 +88,6 @@ class Shown:
     """(k,) expected surface there, in cells: see `SurfaceCells.looked_at`."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Belief:
     """The belief about poses and surface, and the components of the run that would process a new view."""

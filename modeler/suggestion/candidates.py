@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +18,6 @@ Action = Literal["turn", "poke", "lay", "pose"]
 _PUSH_M = 0.03  # by which a finger moves: enough to turn an object of 10 cm by 20° or more
 
 
-@final
 @dataclass(frozen=True)
 class Candidate:
     """One action, and the resulting motion of the object."""

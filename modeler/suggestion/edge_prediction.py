@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 
@@ -51,7 +51,6 @@ _VALLEY: Final = np.exp(-2.0)  # relative to a mode's peak: separates two Gaussi
 _MAX_EDGES: Final = 6  # newest edges used to scale predictions; they scatter by about a factor of two
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PredictedView:
     """A view not yet taken, predicted from the model."""
@@ -74,7 +73,6 @@ class PredictedView:
     """(3,) point in its camera on the axis of turns: other modes of a body on a table are turns about its middle."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PredictedEdge:
     """The predicted edge between a view not yet taken and another."""
@@ -93,7 +91,6 @@ class PredictedEdge:
     """Entropy of the modes' weights."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ColourInformation:
     """Information from colour in the pairs so far, which is expected of further pairs."""
@@ -106,7 +103,6 @@ class ColourInformation:
     """Share of the points that matched in those pairs."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class EdgePredictor:
     """Predicts edges, with parameters learned from the edges so far."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import final
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -31,7 +30,6 @@ def edge_information(object_from_source: Array, covariance: Array) -> Array:
     return 0.5 * (information + information.T)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Gain:
     """Information of the edges of one new frame about the earlier poses."""
@@ -42,7 +40,6 @@ class Gain:
     """(6, 6) of δ afterwards by frame number, including the new frame."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PoseGraphBelief:
     """The joint Gaussian of solved poses."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,6 @@ _TENTH_DEG = 0.1  # resolution of the text
 _ALIKE = 0.9  # of the better gain: a turn is then equally good either way
 
 
-@final
 @dataclass(frozen=True)
 class Goal:
     """When a model is good enough."""
@@ -37,7 +36,6 @@ class Goal:
         return fine and belief.pose_deg <= self.pose_deg and belief.seen >= self.seen
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Suggestion:
     """One action and its predicted effect, in words."""
@@ -78,7 +76,6 @@ class Suggestion:
         return record
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Suggestions:
     """Actions ranked by predicted gain over cost, and the current state of the model."""

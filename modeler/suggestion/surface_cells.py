@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -91,7 +90,6 @@ def enclosing_circle(points_m: Array) -> tuple[Array, float]:
     return centre_m, float(np.sqrt(np.max(np.sum((points_m - centre_m) ** 2, axis=1))))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class SurfaceCells:
     """Cells with observed surface, and cells that may hold unseen surface."""

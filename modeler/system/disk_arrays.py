@@ -7,7 +7,7 @@ import sys
 import tempfile
 import weakref
 from dataclasses import replace
-from typing import IO, TypeVar, final
+from typing import IO, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,6 @@ _Number = TypeVar("_Number", bound=np.generic)
 _ALIGNMENT = 64  # bytes, for every type of number
 
 
-@final
 class DiskArrays:
     """Arrays in files of `TMPDIR`, which have no names, and end with the last of their arrays, or with the process."""
 
@@ -81,7 +80,6 @@ def release(array: npt.NDArray[np.generic]) -> None:
         owner.madvise(mmap.MADV_DONTNEED)
 
 
-@final
 class ViewStore:
     """Keeps frames, and views without the images that a likelihood looks up, ten times as large as the frame.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import final
 
 import numpy as np
 from scipy import ndimage
@@ -24,7 +23,6 @@ _AROUND = 1.1  # radii of the model around the seed of a part of a larger piece
 _REACH = 0.15  # radii of the model by which it may have moved beyond its prediction
 
 
-@final
 @dataclass(frozen=True)
 class CandidateFinder:
     """Finds pieces of a frame that may be the object."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,6 @@ _FAR = 100.0  # times the object's distance: depth beside a model, where nothing
 _MISSING_SHARE = 0.33  # of a closed model's surface; half a ball, as what was seen from one side, lacks a third
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ModelRenderer:
     """Renders a model as a depth camera would see it, without noise.
@@ -218,7 +217,6 @@ class ModelRenderer:
         return scene
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Hits:
     """Where rays meet the surface of a model."""

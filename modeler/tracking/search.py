@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,7 +27,6 @@ RIVAL_NATS: Final = 12.0
 """Below the best pose, a pose of the search is negligible: twice the log of a negligible share."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Viewpoints:
     """A model seen from all around at one distance, at a coarse resolution."""
@@ -68,7 +67,6 @@ class Viewpoints:
         return 1.0 / _NEAR < self.distance_m / distance_m < _NEAR
 
 
-@final
 @dataclass(frozen=True)
 class ViewpointSearch:
     """Searches all rotations: viewpoints all around the model, turned about the line of sight."""

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, final
+from typing import Literal
 
 import numpy as np
 
@@ -62,7 +62,6 @@ _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
 _MOST_TRIED = 3  # of the segments of a frame, the likeliest
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Tracked:
     """The object in one frame."""
@@ -95,7 +94,6 @@ class Tracked:
     """The frame prepared for registration."""
 
 
-@final
 @checked
 @dataclass(eq=False)
 class Tracker:

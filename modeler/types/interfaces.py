@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -181,7 +180,6 @@ class AbstractRegistrar(ABC):
     def posterior_of(self, pair: ViewPair) -> Posterior:
         """Return the posterior of target_from_source. Failure is the posterior's outcome, never an exception."""
 
-    @final
     def register(
         self,
         source: RayImage,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, final
+from typing import Final
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -40,7 +40,6 @@ _INNER: Final[WeakKeyDictionary[RayImage, BoolArray]] = WeakKeyDictionary()  # a
 _FEATURES: Final[WeakKeyDictionary[RayImage, tuple[float, np.ndarray]]] = WeakKeyDictionary()  # with the band's width
 
 
-@final
 @dataclass(frozen=True)
 class Displacement:
     """Where colour is instead of where depth is."""
@@ -74,7 +73,6 @@ class Displacement:
         return " and ".join(parts) or "is where it is"
 
 
-@final
 @dataclass(frozen=True)
 class ColourFit:
     """How well colours of the same surface agree in different views."""
@@ -124,7 +122,6 @@ def _spread(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> l
     return spread(found, _PAIRS)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Pair:
     """Surface that two views see."""
@@ -191,7 +188,6 @@ def _outline(view: RayImage) -> Array:
     return np.argwhere(surface & ~inner)[:, ::-1].astype(np.float64)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Colours of pairs of views, compared under displacements."""

@@ -11,7 +11,7 @@ from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +44,6 @@ _MIN_MATCHES: Final = 60  # points: of fewer, a share of 0.05 is two
 _UPRIGHT: Final = 0.7  # cosine of 45°: a face nearer to the support than to its normal is no side
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Likeness:
     """What two views have in common under the poses found."""

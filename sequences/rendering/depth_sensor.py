@@ -7,7 +7,6 @@ of noise along the ray at 0.8 m, growing with the square of the range.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,6 @@ from scipy.special import ndtr
 from modeler.types import Array, BoolArray
 
 
-@final
 @dataclass(frozen=True)
 class LateralJitter:
     """Correlated lateral jitter of the pixels' rays."""
@@ -36,7 +34,6 @@ class LateralJitter:
         return along_w, along_h
 
 
-@final
 @dataclass(frozen=True)
 class DisparityNoise:
     """Noise and quantisation of the disparity."""
@@ -69,7 +66,6 @@ class DisparityNoise:
         return float(depth_m**2 / focal_baseline * np.hypot(self.sigma_px, self.quantum_px / np.sqrt(12.0)))
 
 
-@final
 @dataclass(frozen=True)
 class GrazingLoss:
     """Drop-out at grazing incidence, in patches."""
@@ -89,7 +85,6 @@ class GrazingLoss:
         return _uniform((share.shape[0], share.shape[1]), 1.0, rng) < share
 
 
-@final
 @dataclass(frozen=True)
 class MixedPixels:
     """Mixed pixels: at depth discontinuities a pixel may measure a depth between the two surfaces."""
@@ -112,7 +107,6 @@ class MixedPixels:
         return np.where(mixed, near + blend * np.where(mixed, far - near, 0.0), depth_m)
 
 
-@final
 @dataclass(frozen=True)
 class RandomLoss:
     """Drop-out of small patches anywhere."""
@@ -159,7 +153,6 @@ def _share(**values: float) -> None:
             raise ValueError(f"{name} must be from 0 to 1")
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Exposure:
     """Ray hits of one image."""
@@ -172,7 +165,6 @@ class Exposure:
     """(h, w) True where the projector's light does not reach."""
 
 
-@final
 @dataclass(frozen=True)
 class DepthSensor:
     """A camera and a projector side by side. An effect that is null is left out."""

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +19,6 @@ from modeler.types import Array, BoolArray, Float32Array, InputError
 STEEP = np.sqrt(0.5)  # surface tilted from upright by more than 45 degrees counts as facing up or down
 
 
-@final
 @dataclass(frozen=True)
 class Chart:
     """A flat image's size on the body: u runs to the right and v down, as seen from outside, each 0 to 1."""
@@ -39,7 +37,6 @@ class Chart:
         return self.width_m * (np.sin(np.pi * v) if self.polar else np.ones_like(v))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Surfels:
     """Points of a mesh's surface."""
@@ -54,7 +51,6 @@ class Surfels:
     """(n, 3) barycentric coordinates."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Places:
     """Where points lie in charts."""
@@ -67,7 +63,6 @@ class Places:
     """(n,)."""
 
 
-@final
 @dataclass(frozen=True)
 class Cylindrical:
     """One image around the z axis, over side-facing surface."""
@@ -105,7 +100,6 @@ class Cylindrical:
         return Places(np.where(covered, 0, -1), _turn(x, y), v)
 
 
-@final
 @dataclass(frozen=True)
 class Spherical:
     """One image around the middle of the body: columns are meridians, rows circles of latitude."""
@@ -131,7 +125,6 @@ _DOWN = np.array([[0, 0, -1]] * 4 + [[0, -1, 0], [0, 1, 0]], np.float64)
 _OUT = np.array([[1, 0, 0], [0, -1, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
 
 
-@final
 @dataclass(frozen=True)
 class Faces:
     """An image on each face of the body's bounding box: facing +x, -y, -x, +y and, if wanted, up and down."""
@@ -158,7 +151,6 @@ class Faces:
         return Places(np.where(face < self.count, face, -1), u, v)
 
 
-@final
 @dataclass(frozen=True)
 class Unwrapped:
     """One image mapped by the texture coordinates of the mesh file."""
@@ -216,7 +208,6 @@ def gamma_coded(light: Array) -> Array:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0) ** (1.0 / 2.4) - 0.055)
 
 
-@final
 @dataclass(frozen=True)
 class Print:
     """A made-up label: patches, bands, bar codes and lines of letter-like blocks, from the large to the small."""
@@ -251,7 +242,6 @@ class Print:
         return inked.reshape(height // _FINE, _FINE, width // _FINE, _FINE, 3).mean(axis=(1, 3)).astype(np.float32)
 
 
-@final
 @dataclass(eq=False)
 class _Canvas:
     """A chart that things are drawn on."""
@@ -315,7 +305,6 @@ _Item = Callable[[Array, Array, np.random.Generator], BoolArray]
 _ITEMS: tuple[_Item, ...] = (_patch, _band, _bar_code, _letters, _letters)
 
 
-@final
 @dataclass(frozen=True)
 class Picture:
     """Image files."""
@@ -328,7 +317,6 @@ class Picture:
         return _fitted(read_colour(self.paths[number % len(self.paths)]), chart, texel_m)
 
 
-@final
 @dataclass(frozen=True)
 class Embedded:
     """The image in the object's own mesh file."""
@@ -340,7 +328,6 @@ class Embedded:
         return _fitted(mesh.picture, chart, texel_m)
 
 
-@final
 @dataclass(frozen=True)
 class Label:
     """An image, or one for every face, wrapped around the object; it replaces the shape's colour there."""
@@ -354,7 +341,6 @@ class Label:
             raise ValueError(f"paths must hold one image or {self.wrap.count}")
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class LabelledMesh:
     """A mesh and its label, made ready for looking colours up."""
@@ -382,7 +368,6 @@ class LabelledMesh:
         return found
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Texture:
     """An image that is looked up between its pixels."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +35,6 @@ _SHORT = 1.0 - 2e-3
 """Light is followed up to just in front of the surface it should reach, which would else block itself."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Hits:
     """First hits of a bundle of rays."""
@@ -66,7 +65,6 @@ class Hits:
         )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Caster:
     """A mesh made ready for rays; one without triangles is met by no ray."""

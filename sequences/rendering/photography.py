@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +20,6 @@ _CREASE = np.cos(np.radians(30.0))
 """Triangles that meet at more than 30 degrees meet at an edge; others are facets of a round surface."""
 
 
-@final
 @dataclass(frozen=True)
 class Lamp:
     """Parallel light, fixed to the camera."""
@@ -36,7 +34,6 @@ class Lamp:
             raise ValueError("direction must not be zero, strength not negative")
 
 
-@final
 @dataclass(frozen=True)
 class Photography:
     """How colour comes about: Lambert's law, Blinn's and Phong's highlights, exposure, noise and sRGB's gamma.
@@ -112,7 +109,6 @@ class Photography:
 _LINEAR = linear_light(np.arange(256) / 255.0)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class LitMesh:
     """A mesh under the lamps."""
@@ -140,7 +136,6 @@ class LitMesh:
         return photography.radiance(albedo, normals, points_m)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class SmoothNormals:
     """The normals of the round surfaces that a mesh's facets stand for.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, final
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from modeler.sequences.rendering.shapes import AnyShape, placement
 from modeler.types import Array, Camera, InputError
 
 
-@final
 @dataclass(frozen=True)
 class Tabletop:
     """The object is pushed over the table by hand: each step turns it by about `step_deg` and shifts it a little."""
@@ -66,7 +65,6 @@ class Tabletop:
         return {"kind": "table", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
 
 
-@final
 @dataclass(frozen=True)
 class Turntable:
     """The object turns about a fixed vertical axis."""
@@ -99,7 +97,6 @@ class Turntable:
         return {"kind": "turntable", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg}
 
 
-@final
 @dataclass(frozen=True)
 class RobotReadings:
     """How well a robot knows where the hand is that holds the object."""
@@ -118,7 +115,6 @@ class RobotReadings:
         return camera_from_model @ se3.exp(rng.normal(size=(len(camera_from_model), 6)) * sigma)
 
 
-@final
 @dataclass(frozen=True)
 class Hand:
     """The object is turned freely in the air, about an axis that wanders."""
@@ -159,7 +155,6 @@ class Hand:
         return {"kind": kind, "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
 
 
-@final
 @dataclass(frozen=True)
 class Place:
     """One pose of the resting object on, or above, the table."""
@@ -170,7 +165,6 @@ class Place:
     """Turns about the fixed x, y and z axes, in this order."""
 
 
-@final
 @dataclass(frozen=True)
 class Places:
     """Poses that are given one by one."""
@@ -219,7 +213,6 @@ def _checked(frames: int, *spreads: float) -> None:
         raise ValueError("standard deviations and shifts must not be negative")
 
 
-@final
 @dataclass(frozen=True)
 class Viewpoint:
     """The camera, and its position relative to the middle of the table."""
@@ -255,7 +248,6 @@ class Viewpoint:
         return pose
 
 
-@final
 @dataclass(frozen=True)
 class Table:
     """A slab whose surface is the plane z = 0."""
@@ -270,7 +262,6 @@ class Table:
             raise ValueError("size_m and thickness_m must be positive")
 
 
-@final
 @dataclass(frozen=True)
 class Wall:
     """An upright wall behind the table."""
@@ -286,7 +277,6 @@ class Wall:
             raise ValueError("size_m must be positive")
 
 
-@final
 @dataclass(frozen=True)
 class Mosaic:
     """The object's colour varies from cell to cell of a grid in space."""
@@ -301,7 +291,6 @@ class Mosaic:
             raise ValueError("cell_m must be positive and contrast from 0 to 1")
 
 
-@final
 @dataclass(frozen=True)
 class TurnedOver:
     """The object is laid down differently within the sequence."""
@@ -316,7 +305,6 @@ class TurnedOver:
             raise ValueError("at must be at least 1, for frame 0 shows the object as rest_rotation_deg says")
 
 
-@final
 @dataclass(frozen=True)
 class Recipe:
     """Everything a synthetic sequence depends on."""

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +53,6 @@ _MOTION, _READINGS, _FRAMES, _PHOTOGRAPHS, _SHIFTS = range(5)  # keys of the see
 _ALIGNED_PX = 0.1  # misalignment by interpolation of colours along the rays of depth, by hand
 
 
-@final
 @dataclass(frozen=True)
 class RenderedSequence(AbstractSequence):
     """A sequence that is rendered as it is read; the same recipe gives the same frames."""

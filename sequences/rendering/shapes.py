@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -120,7 +119,6 @@ _UNIT_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z
 _CUBE_FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 
 
-@final
 @dataclass(frozen=True)
 class Box:
     """A box about the origin."""
@@ -137,7 +135,6 @@ class Box:
         return Mesh.single(_UNIT_CUBE * np.array(self.size_m), np.array(triangles))
 
 
-@final
 @dataclass(frozen=True)
 class Cylinder:
     """A cylinder about the z axis, centred at the origin."""
@@ -155,7 +152,6 @@ class Cylinder:
         return turned(np.array([[self.radius_m, -half], [self.radius_m, half]]), _sides(self.radius_m))
 
 
-@final
 @dataclass(frozen=True)
 class Cone:
     """A cone or a frustum about the z axis, from z = 0 up."""
@@ -175,7 +171,6 @@ class Cone:
         return turned(np.array([[self.radius_m, 0.0], [self.top_radius_m, self.height_m]]), sides)
 
 
-@final
 @dataclass(frozen=True)
 class Sphere:
     """A sphere about the origin."""
@@ -191,7 +186,6 @@ class Sphere:
         return turned(self.radius_m * _arc(-90.0, 90.0, sides), sides)
 
 
-@final
 @dataclass(frozen=True)
 class Capsule:
     """A cylinder about the z axis with round ends, centred at the origin."""
@@ -211,7 +205,6 @@ class Capsule:
         return turned(np.concatenate(ends), sides)
 
 
-@final
 @dataclass(frozen=True)
 class Torus:
     """A round bar bent about the z axis, beginning at the x axis."""
@@ -233,7 +226,6 @@ class Torus:
         return bent(self.radius_m, self.tube_radius_m, arc_deg=self.arc_deg, steps=steps, sides=sides)
 
 
-@final
 @dataclass(frozen=True)
 class Lathe:
     """A solid turned about the z axis."""
@@ -253,7 +245,6 @@ class Lathe:
         return turned(profile, _sides(float(profile[:, 0].max())))
 
 
-@final
 @dataclass(frozen=True)
 class Extrusion:
     """A prism over a polygon, from z = 0 up."""
@@ -276,7 +267,6 @@ class Extrusion:
         return extruded(np.array(self.outline_m), self.height_m)
 
 
-@final
 @dataclass(frozen=True)
 class MeshFile:
     """A closed surface from a file; its z axis should point up."""
@@ -294,7 +284,6 @@ class MeshFile:
         return read_mesh(self.path, self.scale, textured=True)
 
 
-@final
 @dataclass(frozen=True)
 class Part:
     """A shape at its place in a compound: stretched, then turned, then shifted."""
@@ -320,7 +309,6 @@ class Part:
         return mesh if self.rgb is None else mesh.painted(self.rgb)
 
 
-@final
 @dataclass(frozen=True)
 class Compound:
     """The union of several shapes."""

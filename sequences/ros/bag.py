@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, cast, final
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 from urllib.parse import quote
 
 import apsw
@@ -225,7 +225,6 @@ storage_mcap.DECOMPRESSORS.update(lz4=of_size(from_lz4), zstd=of_size(from_zstd)
 storage_mcap.get_msgdef = partial(_definition, known=storage_mcap.get_msgdef)
 
 
-@final
 @dataclass(frozen=True)
 class Stamp:
     """Which message of a topic."""
@@ -236,7 +235,6 @@ class Stamp:
     """Place among the messages of the topic that were received at that very time."""
 
 
-@final
 @dataclass(frozen=True)
 class Bag:
     """A bag that is open while it is used."""
@@ -369,7 +367,6 @@ def _ros2(path: Path) -> rosbag2.Reader:
     return reader
 
 
-@final
 @dataclass(frozen=True)
 class _AsRos2:
     """An MCAP file of ROS 1 that calls itself one of ROS 2, for the library opens no other and reads both alike."""
@@ -381,7 +378,6 @@ class _AsRos2:
         return io.BufferedReader(_Renamed(self.path, mode))
 
 
-@final
 class _Renamed(io.FileIO):
     """A file in which the last letter of the profile reads 2."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -117,7 +117,6 @@ def colour(message: Any, where: str) -> npt.NDArray[np.uint8]:
     return np.ascontiguousarray(in_order)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Raw:
     """An image message as if its pixels had not been packed."""

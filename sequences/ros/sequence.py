@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,7 +83,6 @@ def _camera(bag: Bag, topic: str) -> Lens | None:
     return realsense_lens(bag, topic)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ColourSource:
     """Where colour comes from."""
@@ -160,7 +159,6 @@ def _names(topics: Iterable[str]) -> str:
     return ", ".join(topics) or "none"
 
 
-@final
 @dataclass(frozen=True)
 class RosSequence(AbstractStreams[Stamp]):
     """The depth images of one topic, and the colour images that are aligned to them."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 import numpy.typing as npt
@@ -85,7 +84,6 @@ def nonnegative_solution(aa: float, ab: float, bb: float, a: float, b: float) ->
     return (x, 0.0) if a * x >= b * y else (0.0, y)
 
 
-@final
 @dataclass(frozen=True)
 class FixedPattern:
     """Fixed-pattern noise: errors that a pixel repeats from frame to frame, common to two views (method, eq. 4.9).
