@@ -147,7 +147,7 @@ class FocalFactor:
     """Standard deviation of the depth scale's logarithm; 0 = known, or not asked about."""
     factor_sigma: float = 0.0
     """Standard deviation of the factor's logarithm; 0 = not estimated."""
-    told_by: Literal["loop", "prior"] = "prior"
+    determined_by: Literal["loop", "prior"] = "prior"
     """Whether loops determined the factor."""
 
     def values(self) -> dict[str, float | str]:
@@ -157,7 +157,7 @@ class FocalFactor:
             "focal_factor_sigma": self.factor_sigma,
             "depth_scale": self.depth_scale,
             "depth_scale_sigma": self.depth_scale_sigma,
-            "told_by": self.told_by,
+            "told_by": self.determined_by,
         }
 
     def text(self, facts: Mapping[str, object]) -> str:
@@ -189,7 +189,7 @@ class RefocusedSequence(AbstractDerived):
     def sensor(self) -> SensorNoise | None:
         """Return the noise of its camera, with the uncertainty of its focal length; None if unknown."""
         noise = self.whole.sensor()
-        if self.focal.told_by != "loop" or self.focal.factor_sigma == 0.0:
+        if self.focal.determined_by != "loop" or self.focal.factor_sigma == 0.0:
             return noise
         return (SensorNoise(sigma_r_m=None) if noise is None else noise)._replace(sigma_focal=self.focal.factor_sigma)
 

@@ -141,8 +141,8 @@ def test_an_edge_to_another_view_that_contradicts_what_was_told_does_not_place_a
         search.found[target] = Posterior(3, target, motion, Outcome.CONVERGED, overlap=0.9)
         return bool(search.candidates)
 
-    told = TurntablePrior(24.0, 1.0)
-    assert found(told, 0, 3)
-    assert not found(told, 0, 1)  # three steps were told, and one is found
-    assert found(told, 2, 3)  # the previous view's registration holds what was told
+    given = TurntablePrior(24.0, 1.0)
+    assert found(given, 0, 3)
+    assert not found(given, 0, 1)  # three steps were given, and one is found
+    assert found(given, 2, 3)  # the previous view's registration holds what was given
     assert found(GeneralPrior(limits_assumed=True), 0, 1)

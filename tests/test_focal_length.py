@@ -184,7 +184,7 @@ def test_a_loop_tells_the_focal_length_and_the_poses_under_it(rng: np.random.Gen
     graph, truth = ring(0.03, rng, luck=0.0)
     moving = MovingGraph.of(graph, solve(graph, {}))
     found = moving.estimate(1.0)
-    assert found.told_by == "loop"
+    assert found.determined_by == "loop"
     assert found.log_factor == pytest.approx(0.03, abs=1e-4)
     assert found.sigmas_after < 0.05 < found.sigmas_before
     for frame, pose in moving.at(0.03).poses.items():
@@ -200,7 +200,7 @@ def test_a_mean_far_from_the_prior_is_believed_only_where_loops_tell_it(sigma: f
         return FocalLength(step, sigma, prior_sigma=0.02, loops=1, sigmas_before=3.0, sigmas_after=2.0, by_focal={})
 
     found = estimate_focal_length(estimate_at, rounds=3, tolerance=1.0, reach=0.1)
-    assert (found.log_factor > 0.08, found.told_by) == ((True, "loop") if believed else (False, "prior"))
+    assert (found.log_factor > 0.08, found.determined_by) == ((True, "loop") if believed else (False, "prior"))
     if not believed:
         assert (found.log_factor, found.sigma) == (0.0, 0.02)
 
@@ -226,7 +226,7 @@ def test_an_open_chain_tells_nothing_and_is_as_uncertain_as_the_focal_length(rng
     graph, _ = ring(0.0, rng, luck=1.0, closed=False)
     solution = solve(graph, {})
     found = MovingGraph.of(graph, solution).estimate(0.02)
-    assert (found.log_factor, found.sigma, found.loops, found.told_by) == (0.0, 0.02, 0, "prior")
+    assert (found.log_factor, found.sigma, found.loops, found.determined_by) == (0.0, 0.02, 0, "prior")
     widened, first = solve(graph, {}, focal=found), graph.edges[0].posterior.pose
     np.testing.assert_allclose(widened.relative_covariance(0, 1), first.widened(0.02).covariance, atol=1e-9)
     for frame in range(1, 10):
@@ -288,7 +288,7 @@ def test_poses_and_views_of_a_run_are_those_of_the_focal_length_that_its_loops_t
     focal = shown.solution.focal
     assert focal is not None
     assert held.solution.focal is None
-    assert focal.told_by == "loop"
+    assert focal.determined_by == "loop"
     assert focal.factor == pytest.approx(1.0 / 1.03, abs=0.01)
     assert abs(np.log(1.03 * focal.factor)) < 3.0 * focal.sigma
     ratio = shown.views[0].frame.camera.fx / held.views[0].frame.camera.fx

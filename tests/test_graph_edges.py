@@ -116,10 +116,10 @@ def test_the_opening_of_a_loop_is_in_units_of_what_its_edges_state() -> None:
     squares = []
     for _ in range(300):
         graph, _ = ring(COUNT, rng, [(0, COUNT - 1)])
-        opening = loop_closure_error(graph.edges, Solution(), {})
-        assert opening is not None
-        assert (opening.source, opening.target, opening.edges) == (COUNT - 1, 0, COUNT - 1)
-        squares.append(opening.sigmas**2)
+        error = loop_closure_error(graph.edges, Solution(), {})
+        assert error is not None
+        assert (error.source, error.target, error.edges) == (COUNT - 1, 0, COUNT - 1)
+        squares.append(error.sigmas**2)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.15)  # sd of the mean 0.033, and first order
 
 
@@ -129,10 +129,10 @@ def test_the_opening_of_a_loop_is_what_a_closure_was_turned_by() -> None:
     exact = [edge(k, k + 1, PoseGaussian(_true(truth, k, k + 1), covariance(rng))) for k in range(COUNT - 1)]
     closure = edge(0, 7, PoseGaussian(_true(truth, 0, 7) @ spin([0.0, 0.1, 0.0]), covariance(rng)), "closure")
     centroid_m = {7: OBJECT_M}
-    opening = loop_closure_error([*exact, closure], Solution(), centroid_m)
-    assert opening is not None
-    assert opening.rotation_rad == pytest.approx(0.1)
-    assert opening.translation_m == pytest.approx(0.0, abs=1e-9)
+    error = loop_closure_error([*exact, closure], Solution(), centroid_m)
+    assert error is not None
+    assert error.rotation_rad == pytest.approx(0.1)
+    assert error.translation_m == pytest.approx(0.0, abs=1e-9)
     refused = edge(0, 7, closure.posterior.pose, "closure", accepted=False)
     assert loop_closure_error([*exact, refused], Solution(), centroid_m) is None
     assert loop_closure_error([*exact[1:], closure], Solution(), centroid_m) is None, "no chain joins its ends"

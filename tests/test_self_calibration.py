@@ -52,7 +52,7 @@ def estimate(stated: float, *, closed: bool = True) -> FocalLength:
 @pytest.mark.parametrize("stated", quick_first([0.93, 1.0, 1.06]))
 def test_a_closed_turn_tells_the_focal_length(stated: float) -> None:
     found = estimate(stated)
-    assert found.told_by == "loop"
+    assert found.determined_by == "loop"
     assert found.loops == 1
     assert abs(found.factor * stated - 1.0) < 0.01
     assert abs(np.log(found.factor * stated)) < 3.0 * found.sigma
@@ -62,7 +62,7 @@ def test_a_closed_turn_tells_the_focal_length(stated: float) -> None:
 def test_limits_on_one_step_do_not_cut_off_what_a_run_found_beyond_them() -> None:
     views, edges = seen(1.0)
     found = FocalCalibrator().estimate(views, edges, SENSOR, MODELER.register, GeneralPrior(max_rotation_deg=25.0))
-    assert (found.told_by, found.loops) == ("loop", 1)
+    assert (found.determined_by, found.loops) == ("loop", 1)
     assert abs(found.factor - 1.0) < 0.01
 
 
@@ -74,7 +74,7 @@ def test_a_step_that_cannot_be_registered_again_stays_part_of_its_loop() -> None
         return replace(posterior, outcome=Outcome.NO_OVERLAP) if source.index == 4 else posterior
 
     found = FocalCalibrator().estimate(views, edges, SENSOR, refusing, MODELER.prior)
-    assert found.told_by == "loop"
+    assert found.determined_by == "loop"
     assert abs(1.06 * found.factor - 1.0) < 0.01
 
 
@@ -89,7 +89,7 @@ def test_what_surface_does_not_determine_is_not_foretold_to_move_far() -> None:
 
 def test_an_open_chain_tells_nothing() -> None:
     found = estimate(0.93, closed=False)
-    assert (found.factor, found.sigma, found.told_by) == (1.0, FocalCalibrator().prior_sigma, "prior")
+    assert (found.factor, found.sigma, found.determined_by) == (1.0, FocalCalibrator().prior_sigma, "prior")
 
 
 def test_a_run_without_a_loop_is_calibrated_with_what_was_given(scene: Path, tmp_path: Path) -> None:

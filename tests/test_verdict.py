@@ -298,9 +298,9 @@ def test_loops_open_by_more_than_their_edges_state_speak_against_a_model() -> No
         edges, solution = ring(off_deg)
         worst = loop_check(loop_closure_errors(edges, solution, {}))
         assert worst is not None
-        opening, check = worst
+        error, check = worst
         assert check.holds is holds
-        assert np.degrees(opening.rotation_rad) == pytest.approx(off_deg, abs=1e-6)
+        assert np.degrees(error.rotation_rad) == pytest.approx(off_deg, abs=1e-6)
     assert loop_check(loop_closure_errors(edges[:-1], solution, {})) is None
 
 
@@ -316,8 +316,8 @@ def test_a_loop_open_by_less_than_makes_a_pose_wrong_is_closed_however_precise_i
 
 def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
     edges, solution = ring(2.0)
-    openings = loop_closure_errors(edges, solution, {})
-    one, many = loop_check(openings), loop_check(openings * 50)
+    errors = loop_closure_errors(edges, solution, {})
+    one, many = loop_check(errors), loop_check(errors * 50)
     assert one is not None
     assert many is not None
     assert one[1].limit == pytest.approx(np.sqrt(22.458 / 6.0), rel=1e-3)  # χ² of 6 degrees of freedom, 0.001

@@ -188,10 +188,10 @@ def test_every_pair_is_put_into_words(run: list[Step], recording: Recording) -> 
 def test_the_last_words_tell_by_how_much_the_loop_was_open(run: list[Step], recording: Recording) -> None:
     last = run[-1]
     centroids_m = {frame: view.centroid_m for frame, view in last.views.items()}
-    opening = loop_closure_error(last.edges_so_far, last.solution, centroids_m)
-    assert opening is not None
-    opened = f"{np.degrees(opening.rotation_rad):.1f}° and {1000.0 * opening.translation_m:.1f} mm"
-    assert f"has a closure error of {opened}" in recording[entities.NOW][last.frame.index]["text"][0]
+    error = loop_closure_error(last.edges_so_far, last.solution, centroids_m)
+    assert error is not None
+    words = f"{np.degrees(error.rotation_rad):.1f}° and {1000.0 * error.translation_m:.1f} mm"
+    assert f"has a closure error of {words}" in recording[entities.NOW][last.frame.index]["text"][0]
 
 
 def test_what_the_graph_leaves_to_the_modes_of_a_pair_is_reported(run: list[Step]) -> None:

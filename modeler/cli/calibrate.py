@@ -141,30 +141,30 @@ class CalibrateCamera:
         share = {"neither": 0.5, "focal-length": 1.0, "depth": 0.0}[self.known]
         open_by = abs(math.log(factor)) if self.known == "neither" else 0.0
         given_px = used_px * found.factor / factor
-        result = FocalFactor(factor, given_px, factor**share, 0.5 * open_by, found.sigma, found.told_by)
+        result = FocalFactor(factor, given_px, factor**share, 0.5 * open_by, found.sigma, found.determined_by)
         open_sds = {"sigmas_before": found.sigmas_before, "sigmas_after": found.sigmas_after} if found.loops else {}
         facts = {"sigmas_before": None, "sigmas_after": None, **open_sds, "loops": found.loops}
         write_atomically(self.out, result.text({**facts, "fx_px": found.factor * used_px, "run": str(self.run_folder)}))
         say(f"{_said(found, used_px, given_px)}: {self.out}")
-        if found.told_by == "loop" and result.depth_scale_sigma >= _OPEN:
+        if found.determined_by == "loop" and result.depth_scale_sigma >= _OPEN:
             say(
                 f"or the relief of the depth is wrong by {100.0 * open_by:.0f} %; sizes are known only to "
                 f"{100.0 * result.depth_scale_sigma:.0f} %: give --known to say which of the two is accurate"
             )
-        return 0 if found.told_by == "loop" else 3
+        return 0 if found.determined_by == "loop" else 3
 
 
 def _said(found: FocalLength, used_px: float, given_px: float) -> str:
     from modeler.verdict.advice import focal_length_found, graph_cycles
 
-    if found.told_by == "prior" and found.loops:
+    if found.determined_by == "prior" and found.loops:
         return (
             f"{graph_cycles(found.loops)} do not determine the focal length: closure error of "
             f"{found.sigmas_before:.1f} sd as given, "
             f"{found.sigmas_after:.1f} sd with the best one; if this is large, an edge is wrong: see the worst pairs "
             "in the run's report"
         )
-    if found.told_by == "prior":
+    if found.determined_by == "prior":
         return (
             "no loop determines the focal length; turn the object fully, with overlapping steps, and use a motion "
             "prior (--prior table)"

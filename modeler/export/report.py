@@ -138,7 +138,7 @@ def _camera(
         "focal_factor_sigma": focal.sigma,
         "depth_scale": before["depth_scale"],
         "depth_scale_sigma": total_depth_scale_sigma(float(before["depth_scale_sigma"]), focal),
-        "told_by": focal.told_by,
+        "told_by": focal.determined_by,
         "given_sds": abs(focal.log_factor) / focal.prior_sigma,
         "factor_in_run": in_run,  # beyond the file of a camera
         "fx_px": None if root is None else root.frame.camera.fx,

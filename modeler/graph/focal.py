@@ -163,7 +163,8 @@ def estimate_focal_length(
         estimate = estimate_at(centre)
         if abs(centre - before) > estimate.sigma:  # in less, the noise of registrations would show
             share = float(np.clip((step - estimate.log_factor) / (centre - before), _MIN_SHARE, 1.0))
-    if estimate.told_by == "prior" and abs(centre) > MAX_SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2):
+    farthest = MAX_SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2)
+    if estimate.determined_by == "prior" and abs(centre) > farthest:
         # Farther from the prior's mean than such weak evidence can lead: the rounds disagree, so that an edge is wrong.
         centre, estimate = 0.0, replace(estimate, sigma=estimate.prior_sigma)
     # Noise moves the end of the iteration by as many times more as its steps are too short.

@@ -132,15 +132,15 @@ class Search:
 
     @property
     def candidates(self) -> tuple[Posterior, ...]:
-        """The registrations that may place the view: without those of other views that contradict what was told.
+        """The registrations that may place the view: without those of other views that contradict what was given.
 
-        What was told of the motion is not part of them. So they would be the only evidence for themselves.
+        What was given of the motion is not part of them. So they would be the only evidence for themselves.
         """
         first = self.found.get(self.first)
         return tuple(found for found in self.posteriors if found is first or not self._told_otherwise(found))
 
     def _told_otherwise(self, posterior: Posterior) -> bool:
-        """Return whether a registration contradicts a prior that was told."""
+        """Return whether a registration contradicts a prior that was given."""
         if not posterior.usable:
             return False
         means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
@@ -158,7 +158,7 @@ class Search:
 
 
 def told_otherwise(prior: AbstractPrior, source: RayImage, target: RayImage, steps: int, motions: Array) -> bool:
-    """Return whether all of some motions contradict a prior that was told, as the verdict would say (13.2).
+    """Return whether all of some motions contradict a prior that was given, as the verdict would say (13.2).
 
     Args:
         prior: of the motion between two frames.

@@ -225,7 +225,7 @@ class Reopened:
         if not sigma or not self.solution.covariances:
             return widened(volume.model(watertight=watertight), self.solution)
         graph = PoseGraph(edges=self.edges, first=min(self.solution.trajectory))
-        focal = replace(MovingGraph.of(graph, self.solution).estimate(sigma), sigma=sigma)  # loops have told it already
+        focal = replace(MovingGraph.of(graph, self.solution).estimate(sigma), sigma=sigma)  # loops determined it
         return widened(volume.model(watertight=watertight), replace(self.solution, focal=focal))
 
 

@@ -175,7 +175,7 @@ class FocalLength:
         return float(np.exp(self.log_factor))
 
     @property
-    def told_by(self) -> Literal["loop", "prior"]:
+    def determined_by(self) -> Literal["loop", "prior"]:
         """Source of most of the information: loops or the prior."""
         return "loop" if self.sigma < 0.5 * self.prior_sigma else "prior"
 

@@ -245,7 +245,7 @@ def _has_rival(pair: Likeness, views: Mapping[int, RayImage], steps: int, prior:
 
     It comes there by a quarter turn more or less: about the vertical on a support, where only sides are alike; about
     any axis in the face else. From one frame to the next, nobody turns an object farther than views can be registered,
-    and limits and steps that were told exclude others; in several steps it may come anywhere.
+    and limits and steps that were given exclude others; in several steps it may come anywhere.
 
     Args:
         pair: whose matching surface is flat.

@@ -57,7 +57,7 @@ def row(shape: str, error: float, options: argparse.Namespace) -> dict[str, Any]
         "sigma": found.sigma,
         "sigmas_before": found.sigmas_before,
         "sigmas_after": found.sigmas_after,
-        "told_by": found.told_by,
+        "told_by": found.determined_by,
         "again": stated_factor * again.factor,
     }
 

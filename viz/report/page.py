@@ -420,7 +420,7 @@ CHECKS: Final = {
     ),
     "flat_frames": Check(
         "frames that match the others by one flat face",
-        "Another side of a box matches as well, and neither print nor the motion told excludes it.",
+        "Another side of a box matches as well, and neither print nor the given motion excludes it.",
     ),
     "pose_sd_deg": Check(
         "largest sd of a pose's rotation", "At the limit, one pose in twenty is off by more than 3°.", 1.0, "°"
