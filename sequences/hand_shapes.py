@@ -36,10 +36,6 @@ class HandShape:
         """Return where a frame shows the hand (h, w): points within it, and rays through it that measured nothing.
 
         Measurements in front of or behind it are not part of the hand.
-
-        Args:
-            frame: as read.
-            camera_from_hand: (4, 4).
         """
         w, h = frame.camera.rays()
         rays = np.stack([w, h, np.ones_like(w)], axis=-1)

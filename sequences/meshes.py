@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
 from modeler.sequences.image_files import MAX_PIXELS
+from modeler.sequences.input_files import input_errors
 from modeler.system.regular_files import read_regular
 from modeler.types import Array, InputError
 
@@ -87,20 +91,23 @@ def _joined_uv(meshes: list[Mesh]) -> Array | None:
     )
 
 
-def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
-    """Return the triangles of a mesh file (PLY, OBJ, STL, GLB, ...), its lengths times `scale` in m."""
+@contextmanager
+def opened_mesh(path: Path) -> Iterator[Any]:
+    """Read triangles with finite corners by trimesh; what its parsers, and the block, raise becomes one line."""
     import trimesh  # slow to import, and only needed here
 
-    content = read_regular(path)
-    try:
-        loaded = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix[1:].lower(), process=True)
+    with input_errors(path, "mesh", "convert it to PLY"):
+        mesh = trimesh.load_mesh(io.BytesIO(read_regular(path)), file_type=path.suffix[1:].lower(), process=True)
+        if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+            raise InputError(f"{path}: holds no triangles with finite corners; give a triangle mesh.")
+        yield mesh
+
+
+def read_mesh(path: Path, scale: float, *, textured: bool = False) -> Mesh:
+    """Return the triangles of a mesh file (PLY, OBJ, STL, GLB, ...), its lengths times `scale` in m."""
+    with opened_mesh(path) as loaded:
         vertices, triangles = np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)
         uv, picture = _texture(loaded.visual) if textured else (None, None)
-    except Exception as error:  # trimesh's readers raise whatever their parsers raise
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read as a mesh ({why}); convert it to PLY.") from None
-    if len(triangles) == 0 or not np.isfinite(vertices).all():
-        raise InputError(f"{path}: holds no triangles with finite corners; give a triangle mesh.")
     mesh = Mesh.single(vertices * scale, triangles)
     return mesh if uv is None or len(uv) != len(vertices) else replace(mesh, uv=uv[triangles], picture=picture)
 

@@ -285,7 +285,7 @@ def test_a_broken_image_in_a_mesh_file_is_one_line(tmp_path: Path) -> None:
     whole = unwrapped_square(tmp_path / "square.glb", write_quarters(tmp_path / "q.png")).read_bytes()
     at = whole.index(b"IDAT")
     (tmp_path / "broken.glb").write_bytes(whole[: at + 8] + bytes(20) + whole[at + 28 :])
-    with refused("broken.glb", "cannot be read as a mesh"):
+    with refused("broken.glb", "is not a readable mesh"):
         MeshFile(tmp_path / "broken.glb").mesh()
 
 

@@ -50,11 +50,7 @@ MESSAGES: Final = Messages()  # of this process, for the command that runs
 
 
 def split(arguments: Sequence[str]) -> tuple[Messages, list[str]]:
-    """Return what the options of messages say, and the other arguments.
-
-    Raises:
-        Wrong: if they contradict each other or lack something.
-    """
+    """Return what the options of messages say, and the other arguments; `Wrong` if options contradict each other."""
     levels, path, rest = set[int](), None, list[str]()
     words = iter(arguments)
     for word in words:
@@ -78,11 +74,7 @@ def split(arguments: Sequence[str]) -> tuple[Messages, list[str]]:
 
 @contextlib.contextmanager
 def kept(asked: Messages, arguments: Sequence[str]) -> Iterator[None]:
-    """Print and keep the messages of the block as asked.
-
-    Raises:
-        Wrong: if the file cannot be appended to, or is something else than such a log.
-    """
+    """Print and keep the messages of the block as asked; `Wrong` if the file is not, or cannot be, such a log."""
     before = MESSAGES.least, MESSAGES.file
     MESSAGES.least, MESSAGES.file = asked.least, None if asked.path is None else _opened(asked.path)
     for handler in logging.root.handlers:

@@ -141,12 +141,7 @@ def registrar(
 
 
 def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> AbstractPrior:
-    """Return the requested prior.
-
-    Args:
-        options: as given.
-        sequence: to which it applies; None: several.
-    """
+    """Return the requested prior of a sequence, or of several where that is None."""
     name = prior_name(options, sequence)
     parts = name.split("+")
     for part in parts:

@@ -136,12 +136,7 @@ def model_columns(model: ObjectModel, report: Mapping[str, Any]) -> dict[str, An
 
 
 def enclosed_m3(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> float:
-    """Return the volume in a mesh, each of its holes closed by a fan about the mean of its rim.
-
-    Args:
-        vertices_m: (v, 3).
-        triangles: (t, 3), counter-clockwise from outside.
-    """
+    """Return the volume in a mesh, each of its holes closed by a fan about the mean of its rim."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

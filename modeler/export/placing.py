@@ -210,13 +210,7 @@ def model_up(report: Mapping[str, Any]) -> tuple[Array, UpSource]:
 
 
 def level_axes(up: Array) -> Array:
-    """Return right, forward and up (3, 3), as columns, of level axes that face as the camera does.
-
-    Forward leads away from the camera; where it looks down along `up`, towards the upper edge of the image.
-
-    Args:
-        up: (3,) unit, in camera coordinates.
-    """
+    """Return right, forward and up (3, 3), as columns, of level axes, as a camera faces in which `up` (3,) is up."""
     for ahead in (np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])):
         forward = ahead - up * (up @ ahead)
         length = float(np.linalg.norm(forward))

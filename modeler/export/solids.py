@@ -377,12 +377,7 @@ _SECONDS = 2.0  # in which an object that is put down has come to rest
 
 
 def settled_in_mujoco(scene: Path) -> Settled:
-    """Load a scene in MuJoCo and let the object come to rest.
-
-    Raises:
-        ImportError: if MuJoCo is not installed.
-        ValueError: if it rejects the file.
-    """
+    """Load a scene in MuJoCo and let the object come to rest; `Checks.attempt` takes what this raises."""
     mujoco: Any = importlib.import_module("mujoco")  # its types are known only where it is installed
 
     model = mujoco.MjModel.from_xml_path(str(scene))
@@ -399,12 +394,7 @@ def settled_in_mujoco(scene: Path) -> Settled:
 
 
 def settled_in_pybullet(urdf: Path, drop_m: float) -> Settled:
-    """Load a URDF in PyBullet, its link at a height, and let the object come to rest.
-
-    Raises:
-        ImportError: if PyBullet is not installed.
-        ValueError: if it rejects the file.
-    """
+    """Load a URDF in PyBullet, at a height, and let it come to rest; `Checks.attempt` takes what this raises."""
     import pybullet  # pyright: ignore[reportMissingImports]
 
     client = pybullet.connect(pybullet.DIRECT)

@@ -26,7 +26,7 @@ _USED = (
     "gauss_newton",
     "mixture",
 )
-_USED_TO_FUSE = ("votes", "tsdf", "relief", "marching_cubes", "point_clouds", "colour_fit")
+_USED_TO_FUSE = ("votes", "tsdf", "relief", "marching_cubes", "point_clouds")
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,8 @@ from modeler.export.bop import MODELS_INFO
 from modeler.fusion.symmetries import Axis, Symmetries
 from modeler.sequences import AbstractSequence, FocalFactor, RefocusedSequence
 from modeler.sequences.calibrated import has_focal
-from modeler.system.regular_files import read_json, read_regular
+from modeler.sequences.meshes import opened_mesh
+from modeler.system.regular_files import read_json
 from modeler.tracking.tracker import UNITS_M
 from modeler.types import InputError, ObjectModel, checked
 
@@ -120,19 +120,9 @@ def _colours(visual: Any) -> np.ndarray | None:
 
 def _read(path: Path) -> ObjectModel:
     """Return the mesh in a file of any format, with its colours if it has any."""
-    import trimesh
-
-    content = read_regular(path)
-    try:
-        mesh = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix[1:].lower(), process=True)
+    with opened_mesh(path) as mesh:
         vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        colours = _colours(mesh.visual)
-        normals = np.asarray(mesh.vertex_normals, np.float64)
-    except Exception as error:  # trimesh's readers raise whatever their parsers raise
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read as a mesh ({why}); convert it to PLY") from None
-    if not len(triangles) or not np.isfinite(vertices).all():
-        raise InputError(f"{path}: holds no triangles with finite corners; give a triangle mesh")
+        colours, normals = _colours(mesh.visual), np.asarray(mesh.vertex_normals, np.float64)
     if colours is not None and len(colours) != len(vertices):
         colours = None
     return ObjectModel(

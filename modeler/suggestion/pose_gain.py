@@ -19,12 +19,7 @@ from modeler.types import Array, Edge, Solution
 
 
 def edge_information(object_from_source: Array, covariance: Array) -> Array:
-    """Return the information (6, 6) of an edge on δ_source − δ_target.
-
-    Args:
-        object_from_source: (4, 4).
-        covariance: (6, 6) of target_from_source, about the source's camera.
-    """
+    """Return the information (6, 6) on δ_source − δ_target of an edge with the covariance of target_from_source."""
     adjoint = se3.adjoint(se3.inverse(object_from_source))
     information = adjoint.T @ np.linalg.solve(covariance, adjoint)
     return 0.5 * (information + information.T)

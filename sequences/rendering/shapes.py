@@ -71,11 +71,7 @@ def bent(radius_m: float, tube_radius_m: float, *, arc_deg: float, steps: int, s
 
 
 def ear_clipped(outline: Array) -> IntArray:
-    """Return triangles (p - 2, 3) of a simple polygon (p, 2), counter-clockwise.
-
-    Raises:
-        ValueError: if the polygon crosses itself or runs clockwise.
-    """
+    """Return triangles (p - 2, 3) of a simple polygon (p, 2), counter-clockwise; ValueError for another."""
     left = list(range(len(outline)))
     triangles: list[list[int]] = []
     while len(left) > 3:

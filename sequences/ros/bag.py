@@ -124,32 +124,20 @@ _ZSTD = b"\x28\xb5\x2f\xfd"  # magic bytes of its files
 
 
 def from_bz2(data: bytes, most: int = MAX_BYTES) -> bytes:
-    """Return the unpacked bytes.
-
-    Raises:
-        ValueError: if that is more than `most` bytes, or cut off.
-    """
+    """Return what bzip2 packed; ValueError if it is cut off, or more than `most` bytes."""
     unpacker = bz2.BZ2Decompressor()
     return _whole(unpacker.decompress(data, most + 1), ended=unpacker.eof, most=most)
 
 
 def from_lz4(data: bytes, most: int = MAX_BYTES) -> bytes:
-    """Return the unpacked bytes.
-
-    Raises:
-        ValueError: if that is more than `most` bytes, or cut off.
-    """
+    """Return what LZ4 packed; ValueError if it is cut off, or more than `most` bytes."""
     unpacker = lz4.frame.LZ4FrameDecompressor()
     unpacked = unpacker.decompress(data, most + 1)
     return _whole(unpacked, ended=bool(unpacker.eof), most=most)
 
 
 def from_zstd(data: bytes, most: int = MAX_BYTES) -> bytes:
-    """Return the unpacked bytes.
-
-    Raises:
-        ValueError: if that is more than `most` bytes, cut off, or not packed by zstd.
-    """
+    """Return what zstd packed; ValueError if it is cut off, not of zstd, or more than `most` bytes."""
     unpacked, ended = b"", False
     while data:
         unpacker = zstd.ZstdDecompressor()
@@ -180,11 +168,7 @@ def of_size(unpack: Callable[[bytes, int], bytes]) -> Callable[[bytes, int], byt
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file packed by zstd that would unpack to something enormous; other files are not checked.
-
-    Raises:
-        ValueError: if it would.
-    """
+    """Refuse, by a ValueError, a file packed by zstd that would unpack to something enormous."""
     with open_regular(path) as packed:
         if not is_zstd(packed.read(len(_ZSTD))):
             return

@@ -43,13 +43,7 @@ _TERMS: Final = {
 
 
 def pair_cards(result: Result, pictures: Mapping[int, Thumbnails], centre_m: Array) -> Sequence[str]:
-    """Return every pair with its pictures, its outcome and why it was or was not joined, as HTML.
-
-    Args:
-        result: the run.
-        pictures: by frame number.
-        centre_m: (3,) the object's centre, in the object frame.
-    """
+    """Return every pair with its pictures, its outcome and why it was or was not joined, as HTML."""
     note = (
         "From left: the frame, its object outlined; its surface (<span class='orange'>orange</span>) and that of "
         "the view it is registered to (<span class='teal'>teal</span>) before and after alignment."

@@ -155,12 +155,9 @@ def shade(
 
 
 def portrait(mesh: Mesh, object_from_upright: Array, size: tuple[int, int]) -> bytes:
-    """Return a picture of an upright model, from above on the left, as JPEG.
+    """Return a picture (height, width) in px of an upright model, from above on the left, as JPEG.
 
-    Args:
-        mesh: the model.
-        object_from_upright: (3, 3) right, down and forward as columns.
-        size: height and width in px.
+    `object_from_upright` (3, 3) has right, down and forward as columns.
     """
     away = object_from_upright @ _ABOVE_LEFT
     camera = look_at(mesh.centre_m, away, 4.2 * mesh.radius_m, -object_from_upright[:, 1])
