@@ -109,15 +109,12 @@ class TrajectoryErrors:
 def trajectory_errors(
     trajectory: Mapping[int, Array], camera_from_model: Mapping[int, Array], centroid_m: Array
 ) -> TrajectoryErrors:
-    """Compare a trajectory with the truth, aligned at its first frame.
+    """Compare a trajectory with the truth, aligned at its first frame; ValueError if the trajectory is empty.
 
     Args:
         trajectory: object_from_camera (4, 4) by frame number; the lowest is the first.
         camera_from_model: (4, 4) by frame number, of those frames at least.
         centroid_m: (3,) of the object, in the camera of the first frame.
-
-    Raises:
-        ValueError: if the trajectory is empty.
     """
     if not trajectory:
         raise ValueError("an empty trajectory has no errors; check that a frame was accepted")
@@ -208,11 +205,7 @@ class TrueSurface:
     def of(
         vertices_m: Array, triangles: npt.NDArray[np.int64], rng: np.random.Generator, count: int = SAMPLES
     ) -> TrueSurface:
-        """Return a mesh with points on it.
-
-        Raises:
-            ValueError: if the mesh has no area.
-        """
+        """Return a mesh with points on it; ValueError if the mesh has no area."""
         return TrueSurface(vertices_m, triangles, sample_surface(vertices_m, triangles, count, rng))
 
     def seen(self, frames: Iterable[tuple[Frame, Array]]) -> BoolArray:
@@ -244,7 +237,7 @@ class TrueSurface:
 def surface_errors(
     vertices_m: Array, triangles: npt.NDArray[np.int64], truth: TrueSurface, rng: np.random.Generator
 ) -> SurfaceErrors:
-    """Compare a mesh with the true surface, both in the model frame.
+    """Compare a mesh with the true surface, both in the model frame; ValueError if the mesh has no area.
 
     Distances are from points drawn evenly by area to the nearest place on the other's triangles.
 
@@ -253,9 +246,6 @@ def surface_errors(
         triangles: (t, 3) vertex numbers.
         truth: the true surface.
         rng: draws the points on the mesh.
-
-    Raises:
-        ValueError: if the mesh has no area.
     """
 
     def far_m(points_m: Array, vertices_m: Array, triangles: npt.NDArray[np.int64]) -> Array:
@@ -269,16 +259,13 @@ def surface_errors(
 
 
 def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, rng: np.random.Generator) -> Array:
-    """Return points (count, 3) drawn evenly over the area of a mesh.
+    """Return points (count, 3) drawn evenly over the area of a mesh; ValueError if the mesh has no area.
 
     Args:
         vertices_m: (v, 3).
         triangles: (t, 3) vertex numbers.
         count: number of points.
         rng: source of randomness.
-
-    Raises:
-        ValueError: if the mesh has no area.
     """
     a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)

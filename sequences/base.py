@@ -33,11 +33,7 @@ class AbstractSequence(ABC):
 
     @abstractmethod
     def frame(self, index: int) -> Frame:
-        """Return the frame with number `index`.
-
-        Raises:
-            InputError: if there is no such frame or it cannot be read.
-        """
+        """Return the frame with number `index`; InputError if there is no such frame or it cannot be read."""
 
     def truth(self) -> dict[int, Array] | None:
         """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known.

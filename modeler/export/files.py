@@ -51,11 +51,7 @@ def write_atomically(path: Path, content: str | bytes, *, lasting: bool = False,
 
 
 def settle(*paths: Path) -> None:
-    """Wait until files, and the names in folders, are on the disk.
-
-    Raises:
-        OSError: if one cannot be brought there.
-    """
+    """Wait until files, and the names in folders, are on the disk; OSError if one cannot be brought there."""
     for path in paths:
         opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         try:

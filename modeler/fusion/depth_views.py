@@ -264,16 +264,13 @@ def depth_views(
     cropping: Cropping,
     covariances: Mapping[int, Array] | None = None,
 ) -> DepthViews:
-    """Crop views to a box and stack them.
+    """Crop views to a box and stack them; InputError if no view sees the object in the box.
 
     Args:
         pairs: views with object_from_camera.
         corners_m: (8, 3) corners of the box in the object frame.
         cropping: which pixels count.
         covariances: (6, 6) of object_from_camera by frame number; poses without one count as exact.
-
-    Raises:
-        InputError: if no view sees the object in the box.
     """
     windows = [window(view, se3.inverse(pose), corners_m) for view, pose in pairs]
     size = len(pairs), *_largest(windows)

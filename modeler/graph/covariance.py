@@ -121,11 +121,7 @@ class RelativeCovariance:
         return replace(self, trajectory=trajectory, factors=all_factors, leaves=leaves)
 
     def __call__(self, target: int, source: int) -> Array:
-        """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
-
-        Raises:
-            KeyError: if a frame was not solved.
-        """
+        """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`; KeyError if a frame was not solved."""
         source_from_target = se3.inverse(self.trajectory[source]) @ self.trajectory[target]
         covariance = ROOT_SIGMA**2 * np.eye(6)
         if target == source:
@@ -242,11 +238,7 @@ class SharedCovariance:
     """On the covariances of edges; see `variance_factor`."""
 
     def __call__(self, target: int, source: int) -> Array:
-        """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`.
-
-        Raises:
-            KeyError: if a frame was not solved.
-        """
+        """Return the covariance (6, 6) of ξ in `target_from_source @ exp(ξ)`; KeyError if a frame was not solved."""
         return self._widened(self.independent(target, source), target, source)
 
     @property

@@ -80,11 +80,7 @@ class Factor:
 
     @cached_property
     def between(self) -> gtsam.BetweenFactorPose3:
-        """The factor in GTSAM.
-
-        Raises:
-            ValueError: if the covariance is not positive definite.
-        """
+        """The factor in GTSAM; ValueError if the covariance is not positive definite."""
         # smart=False: GTSAM may otherwise mistake near-singular information for that of a simpler model.
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(self.root_information, False)
         return gtsam.BetweenFactorPose3(self.target, self.source, gtsam.Pose3(self.pose.mean), noise)

@@ -69,11 +69,7 @@ class Smoother:
     state: _State = field(default_factory=_State, repr=False)
 
     def plus(self, edges: Iterable[Edge]) -> Smoother:
-        """Return the smoother with more edges.
-
-        Raises:
-            ValueError: if an accepted edge's covariance is not positive definite.
-        """
+        """Return the smoother with more edges; ValueError if an accepted edge's covariance is not positive definite."""
         return self.to(self.graph.plus(edges))
 
     def to(self, graph: PoseGraph) -> Smoother:

@@ -34,11 +34,7 @@ class DiskArrays:
         self._filled = 0
 
     def written(self, array: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
-        """Return an array that is on disk.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
+        """Return an array that is on disk; OSError if it cannot be written."""
         if not array.size:
             return array
         if self._chunk is None or self._filled + array.nbytes > len(self._chunk):

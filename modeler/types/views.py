@@ -49,11 +49,7 @@ class Camera:
     @classmethod
     @checked
     def of(cls, intrinsics: Intrinsics, shape: tuple[int, ...]) -> Camera:
-        """Return the camera of images of a shape (h, w).
-
-        Raises:
-            InputError: if the intrinsics are invalid.
-        """
+        """Return the camera of images of a shape (h, w); InputError if the intrinsics are invalid."""
         if isinstance(intrinsics, Camera):
             return intrinsics
         numbers = _numbers("camera", intrinsics).astype(np.float64)
@@ -120,7 +116,7 @@ class Frame:
         mask: npt.ArrayLike | None = None,
         colour: np.ndarray | None = None,
     ) -> Frame:
-        """Return a frame of copies of arrays.
+        """Return a frame of copies of arrays; InputError if an array cannot be used.
 
         Args:
             depth_m: (h, w) distance along the optical axis in m; 0, NaN or infinite where nothing was measured.
@@ -129,9 +125,6 @@ class Frame:
             time_s: time of capture in s; None: the index.
             mask: (h, w) true on the object; None: not segmented.
             colour: (h, w, 3) 8-bit RGB, aligned to depth.
-
-        Raises:
-            InputError: if an array cannot be used.
         """
         pixels = _numbers("depth image", depth_m).astype(np.float32)
         if pixels.ndim != 2 or not pixels.size:
