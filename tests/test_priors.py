@@ -13,11 +13,11 @@ from scipy import stats
 
 from modeler import priors, se3
 from modeler.priors import Poke, PokePrior, PredictedProposal, TablePrior, VelocityPrior
-from modeler.priors.checks import check_parameter
 from modeler.priors.common_axis import Axis, common_axis
 from modeler.priors.mixtures import DefensiveMixture, Gaussian, KernelMixture, directions_about
 from modeler.priors.table import on_plane
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, PoseGaussian, RayImage
+from modeler.types.base import check_parameter
 
 every_prior = pytest.mark.parametrize("name", CASES)
 HERE = np.eye(4)

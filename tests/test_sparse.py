@@ -17,7 +17,7 @@ from modeler.segmentation import Scene, Segmenter
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Camera, Frame, Outcome, SensorNoise, Step
 from modeler.views import Sensor
-from modeler.views.sparsity import closed, gap_px, measured_share, nearest_depth
+from modeler.views.rays import closed, gap_px, measured_share, nearest_depth
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, staged
 

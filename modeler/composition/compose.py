@@ -32,13 +32,13 @@ from modeler.priors import (
     VelocityPrior,
     turntable_in,
 )
-from modeler.priors.checks import ParameterError
 from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.sequences import AbstractSequence
 from modeler.sequences.file_names import said_of_angles
 from modeler.sequences.hand_shapes import hand_poses
 from modeler.sequences.input_files import frame_number
 from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError, SensorNoise
+from modeler.types.base import ParameterError
 from modeler.views import Sensor
 
 _GIVEN = {

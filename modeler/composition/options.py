@@ -110,8 +110,8 @@ class PriorOptions:
 
     def given(self, name: str, accepted: Collection[str], of: Mapping[str, Collection[str]]) -> dict[str, Any]:
         """Return the parameters that were given, by field name."""
-        from modeler.priors.checks import ParameterError, check_parameter
         from modeler.types import InputError
+        from modeler.types.base import ParameterError, check_parameter
 
         given = self.parameters()
         for parameter in sorted(given.keys() - set(accepted)):

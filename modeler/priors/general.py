@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.checks import MAX_LENGTH_M, check_parameters
 from modeler.priors.mixtures import directions
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage, checked
+from modeler.types.base import MAX_LENGTH_M, check_parameters
 
 _SMALL_DEG = 30.0  # turn up to which the limit of the centroids' offset is used as given
 LARGE_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of its surface seen before

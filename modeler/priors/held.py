@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.checks import ParameterError, check_parameters
 from modeler.priors.general import GeneralPrior, offset_limit_m, reach_deg, turned_offset_m
 from modeler.priors.mixtures import Alternatives, KernelMixture, defensive_mixture
 from modeler.types import AbstractPoseDensity, AbstractPrior, Edge, HandPoses, RayImage, Solution, checked
+from modeler.types.base import ParameterError, check_parameters
 
 _REGRASPED_SHARE = 0.5  # of the samples: either may be true, and the search must cover both
 

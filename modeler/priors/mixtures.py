@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import i0e, i1e
 
 from modeler import se3
-from modeler.priors.checks import check_covariance
 from modeler.types import AbstractPoseDensity, Array
+from modeler.types.base import check_covariance
 
 NODES = 4097  # of a tabulated distribution function: a thousand times finer than a standard deviation
 _OVERLAP_SAMPLES = 4096  # by which the fraction of a proposal's mass within the support is estimated

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modeler import se3
-from modeler.priors.checks import check_parameters
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, OnPlane, TablePrior, on_plane
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, RayImage, checked
+from modeler.types.base import check_parameters
 
 _STEPS = 20  # integration steps of a push
 _PUSHES = 512  # samples of a push

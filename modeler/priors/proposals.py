@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.priors.checks import check_parameters
 from modeler.priors.general import GeneralPrior
 from modeler.priors.mixtures import KernelMixture, defensive_mixture
 from modeler.registration.features import FeatureMatcher
@@ -24,6 +23,7 @@ from modeler.types import (
     Solution,
     checked,
 )
+from modeler.types.base import check_parameters
 
 _MIN_SIGMA_RAD, _MIN_SIGMA_M = np.radians(2.0), 0.004  # the search does not need more precision
 _INFLATION = 2.0  # factor on the graph's standard deviations, which do not include systematic errors

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from modeler import se3
-from modeler.priors.checks import check_parameters
 from modeler.priors.general import AnyMotion, GeneralPrior, centroid_offset, offset_limit_m, relaxed_rotation_deg
 from modeler.priors.mixtures import across_axis
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, Plane, RayImage, checked
+from modeler.types.base import check_parameters
 
 WOBBLE_DEG, WOBBLE_M = 0.2, 0.0007
 """Standard deviations of the deviation of tables from planes, and of turntables from pure rotation, in one step."""

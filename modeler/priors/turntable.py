@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 
 from modeler import se3
-from modeler.priors.checks import check_parameters
 from modeler.priors.common_axis import UNDECIDED, Axis, common_axis, turn_sense
 from modeler.priors.general import GeneralPrior, centroid_offset, offset_limit_m, reach_deg, turned_offset_m
 from modeler.priors.mixtures import NODES, defensive_mixture, directions_about
@@ -27,6 +26,7 @@ from modeler.types import (
     Solution,
     checked,
 )
+from modeler.types.base import check_parameters
 
 _REACH = 8.0  # standard deviations of the turn that are sampled
 _UP = (0.0, -1.0, 0.0)  # opposite to gravity for an upright camera: y points down

@@ -25,7 +25,7 @@ from modeler.segmentation.planes import choose_support, dominant_planes, fit_bes
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
 from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation, checked
 from modeler.views.range_noise import RangeNoise, range_noise
-from modeler.views.sparsity import closed, gap_px, interpolated, measured_share
+from modeler.views.rays import closed, gap_px, interpolated, measured_share
 
 _CHANGES = 2.0
 """Largest ratio of the spread from frame to frame to the noise within frames at the image's rim, where this is at least

@@ -100,7 +100,7 @@ class AbstractPrior(ABC):
     would be counted twice: `modeler.priors.defensive_mixture(known, [guess])` lets it guide the search only.
     Uncertainties should be honest: a pose outside the support is never found.
 
-    Raise `InputError` in `__post_init__` for parameters out of range (`modeler.priors.checks`), and in `between` if
+    Raise `InputError` in `__post_init__` for parameters out of range (`modeler.types.base`), and in `between` if
     the views lack what the prior needs: the pair is skipped, with the message as its reason.
     """
 
