@@ -312,6 +312,18 @@ def test_the_middle_of_a_hanging_object_that_turns_slowly_is_part_of_it(rng):
         assert one.plane is None
 
 
+def test_a_small_object_that_turns_slowly_is_found_before_a_camera_of_little_noise(rng):
+    """Depth changes by less than the usual noise; but frames show that there is less."""
+    frames, masks = [], []
+    for k in range(12):
+        world = World(tilt_deg=30.0, distance_m=0.15).table()
+        world = world.box((0.0, 0.0, 0.011), (0.006, 0.006, 0.011), turn_deg=5.0 * k, label=OBJECT)
+        frame, mask = world.frame(k, rng, sigma_m=5e-5)
+        frames.append(frame)
+        masks.append(mask)
+    judge(frames, masks, least=0.85)
+
+
 @pytest.mark.parametrize("step_deg", [1.0, 5.0, 30.0])
 def test_a_camera_that_goes_round_is_not_taken_for_noisy_depth(rng, step_deg):
     frames = [

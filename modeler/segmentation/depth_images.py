@@ -52,6 +52,10 @@ class DepthNoise:
         """Return the difference beyond which two measurements at `depth_m` are two surfaces: 3 sigma plus a floor."""
         return 3.0 * self.sigma_m(depth_m) + self.floor_m
 
+    def scaled(self, factor: float) -> DepthNoise:
+        """Return the noise multiplied by a factor at all depths."""
+        return DepthNoise(factor * self.floor_m, factor * self.quadratic_per_m)
+
     def times(self, factor: float, depth_m: float) -> DepthNoise:
         """Return the noise that is larger by a factor of at least 1 at a depth: the part that grows with depth is."""
         whole_m = factor * float(self.sigma_m(np.array(depth_m)))
@@ -133,14 +137,31 @@ def change_at_rim(depths_m: Sequence[Float32Array], camera: Camera, noise: Depth
         camera: the camera.
         noise: what is expected of it.
     """
+    spreads, pixels = _spreads_at_rim(depths_m, camera, noise)
+    least = max((1.0 - _FREE_RIM) * len(spreads), _FREE_RIM * pixels)
+    return float(np.sort(spreads)[::-1][int(least)]) if least < len(spreads) else 0.0
+
+
+def noise_over_frames(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
+    """Return the ratio of the depth's spread over frames to `noise`, the median at the image's rim; 1 if not known.
+
+    Args:
+        depths_m: (n of (h, w), NaN = no measurement) of a camera that stands still.
+        camera: the camera.
+        noise: what is expected of it.
+    """
+    spreads, _ = _spreads_at_rim(depths_m, camera, noise)
+    return float(np.median(spreads)) if len(spreads) and len(depths_m) > _FEW_FRAMES else 1.0
+
+
+def _spreads_at_rim(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> tuple[Array, int]:
+    """Return the spread of the depth over frames at pixels of the rim, in units of `noise`, and the rim's size."""
     stack, readings = _sorted([at_rim(depth_m) for depth_m in depths_m], planning_stride(camera))
     often = readings > MOST * len(stack)
     quarters = [(np.float32(share) * (readings - 1)).round().astype(np.int64) for share in (0.25, 0.5, 0.75)]
     low, middle, high = (np.take_along_axis(stack, place[None], axis=0)[0][often] for place in quarters)
     apart = 2.0 * ndtri(0.75)  # standard deviations from the lower to the upper quartile of a Gaussian
-    spread = np.sort((high - low) / (apart * noise.sigma_m(middle)))[::-1]
-    least = max((1.0 - _FREE_RIM) * len(spread), _FREE_RIM * np.count_nonzero(_rim(often.shape)))
-    return float(spread[int(least)]) if least < len(spread) else 0.0
+    return (high - low) / (apart * noise.sigma_m(middle)), np.count_nonzero(_rim(often.shape))
 
 
 def noise_within(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:

@@ -15,6 +15,7 @@ from modeler.segmentation.depth_images import (
     at_rim,
     change_at_rim,
     edge_of,
+    noise_over_frames,
     noise_within,
     planning_stride,
     point_image,
@@ -30,6 +31,7 @@ from modeler.views.rays import closed, gap_px, interpolated, measured_share
 _CHANGES = 2.0
 """Largest ratio of the spread from frame to frame to the noise within frames at the image's rim, where this is at least
 the expected one: noise of a camera that stands still is the same in both to its fixed pattern, which only lowers it."""
+_LEAST_NOISE = 0.4  # of the expected noise: edges change by more than a rim; with 0.2, masks are as good
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 
@@ -165,7 +167,9 @@ class Segmenter:
     def _learn(self, frames: Sequence[Frame]) -> Scene:
         """Return the scene that frames without masks show, if their camera is static."""
         camera, depths_m, noise = frames[0].camera, [_measured(frame) for frame in frames], self.noise
-        layers, noisier = separate_layers(depths_m, camera, noise), None
+        # What is steady, such as a fixed pattern, does not move anything.
+        changing = noise.scaled(min(max(noise_over_frames(depths_m, camera, noise), _LEAST_NOISE), 1.0))
+        layers, noisier = separate_layers(depths_m, camera, changing), None
         if layers.changes_widely:
             rims_m = [at_rim(depth_m) for depth_m in depths_m]
             within = max(1.0, noise_within(rims_m, camera, noise))
