@@ -76,13 +76,13 @@ class PairColour:
         """
         compared = sum(len(colours.values) for colours in self.colours(band, stride))
         count = scored[:, scores.MATCHES] / compared * self.independent(band, max_independent)
-        gain = -0.5 * count * np.log1p(-(np.clip(correlations(scored), 0.0, _MAX_CORRELATION) ** 2))
+        # To first order in ρ²: the exact logarithm has peaks too narrow to sample.
+        gain = 0.5 * count * np.maximum(correlations(scored), 0.0) ** 2
         return np.asarray(np.logaddexp(0.0, gain - 0.5 * np.log(np.maximum(count, 1.0))), dtype=np.float64)
 
     def curvature(self, correlation: float, band: int, max_independent: float) -> float:
         """Return twice the decrease of `log_likelihoods` per mean square difference of features."""
-        rho = float(np.clip(correlation, 0.0, _MAX_CORRELATION))
-        return self.independent(band, max_independent) * rho / (1.0 - rho**2)
+        return self.independent(band, max_independent) * max(correlation, 0.0)
 
     def independent(self, band: int, max_independent: float) -> float:
         """Return the number of independent features if all surface matches (method, eq. 7.3)."""
