@@ -22,7 +22,7 @@ from modeler.tracking import ModelRenderer, Tracked, Tracker
 from modeler.tracking.errors import of_the_camera, of_the_model
 from modeler.types import Array, Camera, Frame, InputError, ObjectModel, PoseGaussian
 from modeler.views import Sensor
-from modeler.views.rays import thinned
+from modeler.views.rays import part_of, thinned
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, staged
 from studies.tracking.clutter import model_of as model_on_table
@@ -169,6 +169,32 @@ def test_a_frame_is_thinned_to_pixels_of_the_same_rays() -> None:
         assert np.allclose(small.camera.rays()[1], h[start::step, start::step])
         assert np.array_equal(small.depth_m, frame.depth_m[start::step, start::step], equal_nan=True)
         assert sensor.noise.sigma_colour_px == Sensor().noise.sigma_colour_px / step
+
+
+def test_a_part_of_a_frame_has_pixels_of_the_same_rays() -> None:
+    frame = rendered("boot")[0].frame(0)
+    rows, columns = slice(40, 90), slice(7, 140)
+    part = part_of(frame, rows, columns)
+    for seen, whole in zip(part.camera.rays(), frame.camera.rays(), strict=True):
+        assert np.allclose(seen, whole[rows, columns])
+    assert np.array_equal(part.depth_m, frame.depth_m[rows, columns], equal_nan=True)
+
+
+def test_a_view_of_the_model_serves_wherever_the_object_is_shifted_or_turned_about_the_line_of_sight() -> None:
+    sequence, model = rendered("boot")
+    frame, truth = sequence.frame(0), sequence.truth()[0]
+    tracker = Tracker(model, Sensor(sequence.sensor()))
+    view = tracker._view(frame, support=False)
+    assert view is not None
+    first, rendered_at = tracker._shown(truth, view)
+    about = se3.translation(tracker.renderer.centre_m)
+    sight = se3.transform(se3.inverse(truth), np.zeros((1, 3)))[0] - tracker.renderer.centre_m
+    for angle, same in ((1.5, True), (0.1, False)):
+        axis = sight / np.linalg.norm(sight) if same else np.cross(sight, (0.0, 0.0, 1.0)) / np.linalg.norm(sight)
+        turned = truth @ about @ se3.exp(np.append(angle * axis, np.zeros(3))) @ se3.inverse(about)
+        seen, pose = tracker._shown(turned, view)
+        assert (seen is first) == same
+        assert np.allclose(pose, rendered_at if same else turned)
 
 
 def striped(camera_from_model: Array) -> tuple[Frame, ModelRenderer]:

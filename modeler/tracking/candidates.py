@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from scipy import ndimage
@@ -14,6 +15,7 @@ from modeler.segmentation.depth_images import mixed_pixels, pieces, planning_str
 from modeler.segmentation.planes import dominant_planes, heights
 from modeler.tracking.rendering import ModelRenderer
 from modeler.types import Array, BoolArray, Camera, Frame, Plane
+from modeler.views.rays import part_of
 
 _SCENERY = 0.7  # squares of the model's width: larger planes are tables and walls; a cube's face is a third of one
 _GRAZING = 0.05  # least cosine of a plane with the line of sight, below which its area is not known
@@ -21,6 +23,8 @@ _LEAST, _MOST = 0.15, 1.3  # extent of a piece, in widths of the model
 _LEAST_PX = 100  # of a piece, as of the segmenter
 _AROUND = 1.1  # radii of the model around the seed of a part of a larger piece
 _REACH = 0.15  # radii of the model by which it may have moved beyond its prediction
+CLOSE: Final = 2.0
+"""Radii of the model around it that show whether a plane is wider than it."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class CandidateFinder:
             renderer: of the model.
         """
         width_m, points = 2.0 * renderer.radius_m, self._points(frame)
-        off = self._off_scenery(frame, points, width_m)
+        off = self._off_scenery(frame, points, width_m, planning_stride(frame.camera))
         labels = pieces(frame.depth_m, off)
         counts = np.bincount(labels.ravel())
         found: list[tuple[bool, float, BoolArray]] = []
@@ -68,6 +72,15 @@ class CandidateFinder:
 
     def near(self, frame: Frame, camera_from_model: Array, renderer: ModelRenderer) -> BoolArray:
         """Return the mask (h, w) of what is near the model in a pose (4, 4), and not part of tables and walls."""
+        mask = np.zeros(frame.depth_m.shape, dtype=bool)
+        window = renderer.around(camera_from_model, frame.camera, CLOSE)
+        if mask[window].size:
+            stride = planning_stride(frame.camera)
+            mask[window] = self._near(part_of(frame, *window), camera_from_model, renderer, stride)
+        return mask
+
+    def _near(self, frame: Frame, camera_from_model: Array, renderer: ModelRenderer, stride: int) -> BoolArray:
+        """Return `near` of the part of a frame around the pose."""
         centre_m = se3.transform(camera_from_model, renderer.centre_m[None])[0]
         reach_m = _REACH * renderer.radius_m
         reach_px = max(round(reach_m * frame.camera.fx / max(float(centre_m[2]), 1e-3)), 1)
@@ -86,16 +99,16 @@ class CandidateFinder:
         close = (seen_m > nearest - 2.0 * reach_m) & (seen_m < farthest + 2.0 * reach_m)
         mask = np.zeros_like(covered)
         mask[window] = close
-        return without_specks(mask & self._off_scenery(frame, points, 2.0 * renderer.radius_m))
+        return without_specks(mask & self._off_scenery(frame, points, 2.0 * renderer.radius_m, stride))
 
     def _points(self, frame: Frame) -> np.ndarray:
         """Return the points (h, w, 3) of a frame."""
         depth_m = np.where(frame.depth_m > 0.0, frame.depth_m, np.float32(np.nan)).astype(np.float32)
         return point_image(depth_m, frame.camera)
 
-    def _off_scenery(self, frame: Frame, points: np.ndarray, width_m: float) -> BoolArray:
+    def _off_scenery(self, frame: Frame, points: np.ndarray, width_m: float, stride: int) -> BoolArray:
         """Return the measured pixels (h, w) off planes that are wider than the model, and between surfaces."""
-        stride, depth_m = planning_stride(frame.camera), points[..., 2]
+        depth_m = points[..., 2]
         tolerance_m = self.noise.tolerance_m(depth_m)
         pixel_m = (depth_m / frame.camera.fx).astype(np.float32)
         off: BoolArray = np.isfinite(depth_m) & ~mixed_pixels(depth_m, tolerance_m=tolerance_m, pixel_m=pixel_m)

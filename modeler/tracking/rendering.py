@@ -129,6 +129,20 @@ class ModelRenderer:
         depth_m = np.repeat(np.repeat(depth_m, stride, axis=0), stride, axis=1)[: camera.height, : camera.width]
         return np.isfinite(depth_m), depth_m.astype(np.float64)
 
+    def around(self, camera_from_model: Array, camera: Camera, radii: float) -> tuple[slice, slice]:
+        """Return the rows and columns of an image within some radii of the model in a pose (4, 4), maybe none."""
+        x, y, z = se3.transform(camera_from_model, self.centre_m[None])[0]
+        near_m = max(z - self.radius_m, 0.2 * self.radius_m)
+        z, reach = max(z, near_m), radii * self.radius_m / near_m
+        rows, columns = (
+            slice(*np.clip([focal * (at - reach) + middle, focal * (at + reach) + middle + 1.0], 0, size).astype(int))
+            for at, focal, middle, size in (
+                (y / z, camera.fy, camera.cy, camera.height),
+                (x / z, camera.fx, camera.cx, camera.width),
+            )
+        )
+        return rows, columns
+
     def _cropped(self, camera_from_model: Array, camera: Camera, most_px: float) -> tuple[Camera, float]:
         """Return the part of a camera's image around the model, at most so fine as is of use, and its pixels' width."""
         x, y, z = se3.transform(camera_from_model, self.centre_m[None])[0]

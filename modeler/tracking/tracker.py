@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
@@ -20,11 +19,12 @@ from modeler.registration.posterior import MIN_MODE_SHARE
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.search import Search
 from modeler.segmentation import Scene, Segmenter
-from modeler.tracking.candidates import CandidateFinder
+from modeler.tracking.candidates import CLOSE, CandidateFinder
 from modeler.tracking.errors import free_directions, of_the_camera, of_the_model
 from modeler.tracking.odds import log_odds, relative_weights
 from modeler.tracking.rendering import COARSE_PX, FINE_PX, MOST_PX, ModelRenderer
 from modeler.tracking.search import RIVAL_NATS, Viewpoints, ViewpointSearch
+from modeler.tracking.tracked import USABLE_M, USABLE_RAD, Presence, Tracked
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -42,12 +42,8 @@ from modeler.types import (
     pooled,
 )
 from modeler.views import Sensor
-from modeler.views.rays import thinned
+from modeler.views.rays import part_of, thinned
 
-Presence = Literal["found", "followed", "unsure", "not there", "too few points"]
-
-USABLE_RAD, USABLE_M = np.radians(3.0), 0.005
-"""Largest standard deviations, of a rotation and of the object's place, with which a pose is of use."""
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Metres in a unit of length."""
 
@@ -60,38 +56,6 @@ _BEYOND_DOUBT = 30.0  # nats from which no other place is searched: twice what a
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
 _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
 _MOST_TRIED = 3  # of the segments of a frame, the likeliest
-
-
-@dataclass(frozen=True, eq=False)
-class Tracked:
-    """The object in one frame."""
-
-    frame: int
-    """Number of the frame."""
-    time_s: float
-    """Time of the frame."""
-    outcome: Presence
-    """`found` without knowledge of the frames before, `followed` from these, or neither.
-
-    It is `unsure` if other objects may match as well: too little is seen, another place matches, or the images leave a
-    rotation open that is no symmetry of the model.
-    """
-    pose: PoseGaussian | None = None
-    """camera_from_model, its covariance with the errors of model and camera; None where the object is not there."""
-    modes: tuple[Mode, ...] = ()
-    """The separate modes of camera_from_model, heaviest first; empty for a single one."""
-    overlap: float = 0.0
-    """Share (0..1) of the surface that frame and model should both show, at the pose, that both do show."""
-    usable: bool = False
-    """Whether there is one mode, but for the model's symmetries, with an sd of at most `USABLE_RAD` and `USABLE_M`.
-
-    Both are given the camera, whose focal length and depth scale move all poses alike."""
-    reason: str = ""
-    """Why the object is not there, or the pose not usable."""
-    seconds: float = 0.0
-    """Wall time in s."""
-    view: RayImage | None = field(default=None, repr=False)
-    """The frame prepared for registration."""
 
 
 @checked
@@ -131,6 +95,8 @@ class Tracker:
     """The last two frames, at most, in which the object was placed one after the other."""
     _around: list[Viewpoints] = field(default_factory=list, init=False, repr=False)
     """The viewpoints of the last searches."""
+    _rendered: tuple[RayImage, Array] | None = field(default=None, init=False, repr=False)
+    """The view of the model that followed frames are compared with, and camera_from_model (4, 4) there."""
 
     def __post_init__(self) -> None:
         """Reject a model without surface, and a seed that random generators do not take, by an `InputError`."""
@@ -173,7 +139,7 @@ class Tracker:
         nothing = Tracked(frame.index, frame.time_s, "too few points", reason="no segment is large enough")
         segmented = frame.mask is not None or self.scene.still or self.scene.alone
         if segmented:
-            view = self._view(frame, support=not self._follows or self.prior is not None)
+            view = self._near_prediction(frame) if self._follows else self._view(frame, support=True)
             followed = None if view is None else self._followed(view, rng)
             if followed is not None and (followed.usable or not self.newest[-1].usable):
                 return followed
@@ -184,7 +150,7 @@ class Tracker:
         clear = frame.unoccluded
         if self._follows:
             near = self.finder.near(clear, self._predicted(frame), self.renderer)
-            view = self._view(replace(clear, mask=near), support=self.prior is not None)
+            view = self._near_prediction(replace(clear, mask=near))
             followed = None if view is None else self._followed(view, rng)
             if followed is not None:
                 return followed
@@ -195,6 +161,20 @@ class Tracker:
     def _follows(self) -> bool:
         """Whether the frames before say where the object is."""
         return bool(self.newest) and not self.independent
+
+    def _near_prediction(self, frame: Frame) -> RayImage | None:
+        """Return a frame prepared for registration where the object is predicted, as `_view` does."""
+        if self.prior is not None:
+            return self._view(frame, support=True)
+        mask = frame.mask
+        if mask is None:
+            segmented = self.segmenter.segment(frame, self.scene)
+            if segmented.outcome not in SEGMENTED:
+                return None
+            mask = segmented.mask
+        window = self.renderer.around(self._predicted(frame), frame.camera, CLOSE)
+        close = mask[window].any()
+        return self._view(part_of(replace(frame, mask=mask), *window), support=False) if close else None
 
     def _guessed(self, frame: Frame, mask: BoolArray) -> RayImage | None:
         """Return a frame with a guessed mask (h, w), prepared; its support is no face of another thing beside it."""
@@ -238,9 +218,10 @@ class Tracker:
         assert last.pose is not None
         assert last.view is not None
         if self.prior is None:
-            seen = self.renderer.view(expected, view.frame.camera, self.sensor)
-            density: AbstractPoseDensity = _near(view, _STEP_SIGMA_RAD, _STEP_SIGMA)
-            registrar = _FOLLOWING
+            seen, rendered = self._shown(expected, view)
+            predicted = rendered @ se3.inverse(expected)
+            density: AbstractPoseDensity = _near(view, _STEP_SIGMA_RAD, _STEP_SIGMA, predicted)
+            expected, registrar = rendered, _FOLLOWING
         else:
             expected, registrar = last.pose.mean, self.registrar
             seen = self.renderer.view(
@@ -257,6 +238,20 @@ class Tracker:
         if not posterior.convincing:
             return None
         return self._tracked(view, "followed", [(1.0, posterior, expected)])
+
+    def _shown(self, expected: Array, view: RayImage) -> tuple[RayImage, Array]:
+        """Return a view of the model about as it is seen in a predicted pose (4, 4), and its own pose (4, 4).
+
+        It is that of the frame before where the camera has since moved little about the model: a shift or a turn about
+        the line of sight shows the same surface. Rendering is a quarter of the work.
+        """
+        camera = view.frame.camera
+        if self._rendered is not None and self._rendered[0].frame.camera.fx == camera.fx:
+            here_m, there_m = (se3.inverse(pose)[:3, 3] for pose in (expected, self._rendered[1]))
+            if np.linalg.norm(here_m - there_m) < _STEP_SIGMA_RAD * np.linalg.norm(here_m - self.renderer.centre_m):
+                return self._rendered
+        self._rendered = self.renderer.view(expected, camera, self.sensor), expected
+        return self._rendered
 
     def _predicted(self, frame: Frame) -> Array:
         """Return camera_from_model (4, 4) as constant velocity predicts it."""
@@ -470,10 +465,10 @@ _FOLLOWING = VisibilityRegistrar(search=Search(min_starts=12, max_starts=12, pro
 """Few starts: the pose is predicted."""
 
 
-def _near(view: RayImage, sigma_rad: float, sigma: float) -> KernelMixture:
-    """Return a proposal about no motion, in units of the object's size."""
+def _near(view: RayImage, sigma_rad: float, sigma: float, motion: Array | None = None) -> KernelMixture:
+    """Return a proposal about a motion (4, 4), or none, in units of the object's size."""
     return KernelMixture(
-        np.eye(4)[None],
+        (np.eye(4) if motion is None else motion)[None],
         np.ones(1),
         centre_m=view.centroid_m,
         sigma_rad=sigma_rad,

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from modeler.kernels import planes
@@ -325,6 +324,31 @@ def _drawn_plane(plane: Plane, factor: float) -> Plane:
     return replace(plane, normal=drawn / length, offset_m=plane.offset_m / length)
 
 
+def part_of(frame: Frame, rows: slice, columns: slice) -> Frame:
+    """Return a frame at some rows and columns, both with the same step, of a camera that sees these alone."""
+    rows, columns = (
+        slice(*axis.indices(size)) for axis, size in zip((rows, columns), frame.depth_m.shape, strict=True)
+    )
+    kept, camera, step = (rows, columns), frame.camera, rows.step
+    depth_m = np.ascontiguousarray(frame.depth_m[kept])
+    part = Camera(
+        depth_m.shape[1],
+        depth_m.shape[0],
+        camera.fx / step,
+        camera.fy / step,
+        (camera.cx - columns.start) / step,
+        (camera.cy - rows.start) / step,
+    )
+    return replace(
+        frame,
+        depth_m=depth_m,
+        camera=part,
+        mask=None if frame.mask is None else np.ascontiguousarray(frame.mask[kept]),
+        colour=None if frame.colour is None else np.ascontiguousarray(frame.colour[kept]),
+        occluder=None if frame.occluder is None else np.ascontiguousarray(frame.occluder[kept]),
+    )
+
+
 def thinned(frame: Frame, sensor: Sensor, step: int) -> tuple[Frame, Sensor]:
     """Return a frame at every `step`-th pixel in both directions, and its sensor.
 
@@ -332,30 +356,11 @@ def thinned(frame: Frame, sensor: Sensor, step: int) -> tuple[Frame, Sensor]:
     """
     if step == 1:
         return frame, sensor
-    start = (step - 1) // 2  # the middle of a square of `step` px
-    kept = (slice(start, None, step), slice(start, None, step))
-    depth_m, camera = np.ascontiguousarray(frame.depth_m[kept]), frame.camera
-    colour: npt.NDArray[np.uint8] | None = None
     if frame.colour is not None:
         sigma_px = math.sqrt((step**2 - 1) / 12.0)
         colour = np.empty_like(frame.colour)
         ndimage.gaussian_filter(frame.colour, (sigma_px, sigma_px, 0.0), output=colour, truncate=2.0)
-        colour = np.ascontiguousarray(colour[kept])
-    small = Frame(
-        frame.index,
-        frame.time_s,
-        depth_m,
-        Camera(
-            depth_m.shape[1],
-            depth_m.shape[0],
-            camera.fx / step,
-            camera.fy / step,
-            (camera.cx - start) / step,
-            (camera.cy - start) / step,
-        ),
-        None if frame.mask is None else np.ascontiguousarray(frame.mask[kept]),
-        colour,
-        None if frame.occluder is None else np.ascontiguousarray(frame.occluder[kept]),
-    )
+        frame = replace(frame, colour=colour)
+    kept = slice((step - 1) // 2, None, step)  # the middle of a square of `step` px
     noise = sensor.noise._replace(sigma_colour_px=sensor.noise.sigma_colour_px / step)
-    return small, replace(sensor, noise=noise, noise_area_px=sensor.noise_area_px / step**2)
+    return part_of(frame, kept, kept), replace(sensor, noise=noise, noise_area_px=sensor.noise_area_px / step**2)
