@@ -8,7 +8,7 @@ from tabletop import BALL, POSES
 
 from modeler import se3
 from modeler.fusion import Fuser, widened
-from modeler.fusion.meshing import flattened_m
+from modeler.fusion.meshing import flattened_m, normals_of
 from modeler.types import ObjectModel, Solution
 
 
@@ -18,8 +18,22 @@ def test_smoothing_moves_a_ball_by_its_curvature() -> None:
     vertices_m, triangles = np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int64)
     for moment_m2 in (1e-6, 1e-5, 1e-4):  # the last is beyond the passes
         moved_m = flattened_m(vertices_m, triangles, vertices_m / 0.05, moment_m2)
-        assert np.mean(moved_m) == pytest.approx(-moment_m2 / 0.05, rel=0.05)  # triangles differ in size
-        np.testing.assert_allclose(moved_m, -moment_m2 / 0.05, rtol=0.25)
+        assert np.mean(moved_m) == pytest.approx(moment_m2 / 0.05, rel=0.05)  # triangles differ in size
+        np.testing.assert_allclose(moved_m, moment_m2 / 0.05, rtol=0.25)
+
+
+def test_smoothing_moves_what_is_near_an_edge() -> None:
+    """Half a kernel beside it as well, where smoothed surface is flat again."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    for _ in range(5):
+        box = box.subdivide()
+    vertices_m, triangles = np.asarray(box.vertices), np.asarray(box.faces, dtype=np.int64)
+    moved_m = flattened_m(vertices_m, triangles, normals_of(vertices_m, triangles), 1e-4)
+    beside = np.sort(0.05 - np.abs(vertices_m), axis=1)  # distances from the planes of three faces
+    near = np.isclose(beside[:, 0], 0.0) & (beside[:, 1] > 0.003) & (beside[:, 1] < 0.007)
+    middle = np.isclose(beside[:, 0], 0.0) & (beside[:, 1] > 0.045)
+    assert moved_m[near].min() > 1e-3
+    assert moved_m[middle].max() < 1e-4
 
 
 def test_smoothing_moves_no_plane() -> None:

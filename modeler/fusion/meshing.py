@@ -358,7 +358,9 @@ def without_relief(vertices_m: Array, triangles: Triangles, limits_m: Array) -> 
 
 
 def flattened_m(vertices_m: Array, triangles: Triangles, normals: Array, moment_m2: float) -> Array:
-    """Return by how much (v,) in m smoothing over a surface moves it along its normals (method, eq. 12.9).
+    """Return how far (v,) in m smoothing over a surface moves it along its normals, by root mean square.
+
+    The mean is over the same kernel: smoothed surface does not show where in it an edge was (method, eq. 12.9).
 
     Args:
         vertices_m: (v, 3).
@@ -374,10 +376,15 @@ def flattened_m(vertices_m: Array, triangles: Triangles, normals: Array, moment_
     passes = min(int(np.ceil(moment_m2 / (0.25 * edge_m2))), FLATTENING_PASSES)
     reached_m2 = passes * 0.25 * edge_m2
     step, scale = 0.5 * min(moment_m2 / reached_m2, 1.0), max(moment_m2 / reached_m2, 1.0)
-    mean, smooth = _means(_neighbours(triangles), len(vertices_m)), vertices_m.copy()
-    for _ in range(passes):
-        smooth += step * (mean @ smooth - smooth)
-    return scale * np.sum((smooth - vertices_m) * normals, axis=1)
+    mean = _means(_neighbours(triangles), len(vertices_m))
+
+    def smoothed(values: Array) -> Array:
+        for _ in range(passes):
+            values = values + step * (mean @ values - values)
+        return values
+
+    moved_m = scale * np.sum((smoothed(vertices_m) - vertices_m) * normals, axis=1)
+    return np.sqrt(smoothed(moved_m**2))
 
 
 def _across(triangles: Triangles) -> Triangles:
