@@ -11,6 +11,7 @@ import numpy.typing as npt
 import open3d as o3d
 import pytest
 import trimesh
+from PIL import Image
 from run_builders import an_edge, ball, made_up_steps, strict_json
 from scipy.spatial.transform import Rotation
 from turning_box import steps
@@ -41,6 +42,7 @@ from modeler.runs.reopening import reopened
 from modeler.system.pictures import raycaster, tensor
 from modeler.types import (
     Array,
+    BoolArray,
     InputError,
     ObjectModel,
     Plane,
@@ -293,9 +295,9 @@ def test_flat_surface_needs_few_triangles_and_moves_by_less_than_its_deviation(r
 
 @pytest.mark.parametrize("suffix", ["obj", "glb"])
 def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> None:
-    def paint(points: Array, normals: Array, _: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    def paint(points: Array, normals: Array, _: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], BoolArray]:
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
-        return np.rint(255.0 * ((points - [0.0, 0.0, 0.8]) / 0.1 + 0.5)).astype(np.uint8)
+        return np.rint(255.0 * ((points - [0.0, 0.0, 0.8]) / 0.1 + 0.5)).astype(np.uint8), points[:, 0] > 0.0
 
     model, texture = textured(ball(), paint, 256)
     assert texture.image.shape == (256, 256, 3)
@@ -303,8 +305,9 @@ def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> Non
     assert 0.4 < areas_m2[0] / areas_m2[1] < 0.9
     out = tmp_path / f"a ball.{suffix}"  # other programs end names at spaces
     write_mesh(model, out, texture)
-    assert {path.name for path in tmp_path.iterdir()} - {out.name} <= {"a_ball.mtl", "a_ball.png"}
-    assert {path.suffix for path in tmp_path.iterdir()} == ({".obj", ".mtl", ".png"} if suffix == "obj" else {".glb"})
+    beside = {"a_ball_seen.png"} | ({"a_ball.mtl", "a_ball.png"} if suffix == "obj" else set())
+    assert {path.name for path in tmp_path.iterdir()} == {out.name} | beside
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a_ball_seen.png")), 255 * texture.seen)
     mesh = loaded_mesh(out)
     assert {frozenset(map(tuple, t)) for t in np.round(mesh.triangles, 5)} == {
         frozenset(map(tuple, t)) for t in np.round(ball().vertices_m[ball().triangles], 5)
@@ -319,8 +322,12 @@ def test_texture_shows_each_point_its_colour(tmp_path: Path, suffix: str) -> Non
     assert np.abs(shown - expected).max() < 6.0  # half a texel moves a colour by two or three
 
 
+def plain(points: Array, *_: npt.NDArray[np.generic]) -> tuple[npt.NDArray[np.uint8], BoolArray]:
+    return np.full((len(points), 3), 7, dtype=np.uint8), np.ones(len(points), dtype=bool)
+
+
 def test_texture_needs_a_format_that_holds_it(tmp_path: Path) -> None:
-    model, texture = textured(ball(), lambda points, *_: np.full((len(points), 3), 7, dtype=np.uint8), 64)
+    model, texture = textured(ball(), plain, 64)
     with pytest.raises(InputError, match="has no textures"):
         write_mesh(model, tmp_path / "ball.stl", texture)
     assert not list(tmp_path.iterdir())

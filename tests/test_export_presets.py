@@ -202,7 +202,8 @@ def test_usd_holds_a_rigid_body_in_metres(tmp_path: Path, coloured: bool) -> Non
     parts = solids.ConvexParts(((brick(pose).vertices_m, brick().triangles),) * 2, "itself, twice")
     model, of, texture = ball(), solids.PhysicsFiles(tmp_path / "a ball", coloured), None
     if coloured:
-        model, texture = textured(model, lambda points, *_: np.full((len(points), 3), (200, 20, 90), np.uint8), 64)
+        red = np.array([200, 20, 90], dtype=np.uint8)
+        model, texture = textured(model, lambda at, *_: (np.tile(red, (len(at), 1)), np.ones(len(at), dtype=bool)), 64)
         of.folder.mkdir()
         of.texture.write_bytes(encoded(texture.image, "PNG"))
     write_usd(of, model, texture, body, parts)
@@ -289,7 +290,7 @@ def test_both_bop_exports_have_one_frame(cli: Run, built: Path, tmp_path: Path) 
     ("purpose", "name", "files"),
     quick_first(
         [
-            ("foundationpose", "fp", {"model.obj", "model.mtl", "model.png", "model.obj.pose.json"}),
+            ("foundationpose", "fp", {"model.obj", "model.mtl", "model.png", "model_seen.png", "model.obj.pose.json"}),
             ("print", "solid", {"model.stl", "model.stl.pose.json"}),
             ("mujoco", "mj", {"mj.xml", "scene.xml", "visual.obj", "visual.obj.pose.json"}),
             ("isaac", "is", {"is.usd", "is.usd.pose.json"}),
@@ -310,7 +311,8 @@ def test_every_preset_ends_with_what_was_checked(
     last = ended.err.splitlines()[-1]
     assert (ended.status, ended.out) == (0, ""), ended.err
     assert last.startswith("modeler: checked: ")
-    there = {path.name for path in out.iterdir() if not path.name.startswith(("part_", "visual.mtl", "visual.png"))}
+    coloured = ("part_", "visual.mtl", "visual.png", "visual_seen.png")
+    there = {path.name for path in out.iterdir() if not path.name.startswith(coloured)}
     assert there == files
     if purpose == "print":
         mesh = trimesh.load_mesh(out / "model.stl")

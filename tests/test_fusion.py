@@ -404,6 +404,20 @@ def test_what_a_lamp_shades_in_turn_gets_one_colour() -> None:
     assert np.std(off) < 0.05  # 0.13 as the views see it, 0.18 where gains of whole views make up for it
 
 
+def test_highlights_of_single_views_leave_no_trace(brick):
+    def shining(view: RayImage) -> RayImage:
+        assert view.frame.colour is not None
+        colour = view.frame.colour.copy()
+        colour[tuple(view.pixels[: len(view.pixels) // 8].T)] = 235
+        return replace(view, frame=replace(view.frame, colour=colour))
+
+    views = {k: shining(view) if k % 5 == 0 else view for k, view in tabletop.views(BRICK, POSES).items()}
+    model = FUSER.fuse(views, tabletop.trajectory(POSES))
+    assert model.vertex_colours is not None
+    assert brick.vertex_colours is not None
+    assert np.quantile(np.abs(model.vertex_colours.astype(int) - brick.vertex_colours), 0.99) <= 8
+
+
 def test_colours_count_less_where_they_may_be_those_of_the_background(monkeypatch):
     """Colour that is 4 px beside its depth: what one view sees at its silhouette, another sees within."""
     poses, views = tabletop.trajectory(POSES), tabletop.views(PLATE, POSES)

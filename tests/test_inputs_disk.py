@@ -73,7 +73,7 @@ def write_half(scene: Path, path: Path) -> Path:
 def test_a_texture_is_exported_from_the_frames_of_a_run(built: Path, tmp_path: Path) -> None:
     small = ["--texture-px", "256", "--triangles", "800"]
     assert main(["export", str(built), "--out", str(tmp_path / "m.obj"), "--texture", *small]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"m.obj", "m.obj.pose.json", "m.mtl", "m.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"m.obj", "m.obj.pose.json", "m.mtl", "m.png", "m_seen.png"}
 
 
 @pytest.mark.parametrize("name", ["m.ply", "m.obj"])

@@ -17,7 +17,7 @@ from modeler.export.files import mesh_ply, write_atomically
 from modeler.export.placing import CAMERA_AXES
 from modeler.system.pictures import encoded, linear_light, raycaster, tensor
 from modeler.system.processes import check_installed
-from modeler.types import Array, InputError, ObjectModel
+from modeler.types import Array, BoolArray, InputError, ObjectModel
 
 FORMATS = (".ply", ".obj", ".glb", ".stl", ".3mf")
 TEXTURED = (".obj", ".glb")
@@ -52,11 +52,17 @@ def format_of(out: Path) -> str:
 
 
 def files_of(out: Path, *, textured: bool = False) -> tuple[Path, ...]:
-    """Return the files that `write_mesh` writes: `out`, and of a textured OBJ its material and its image."""
-    if not textured or out.suffix.lower() != ".obj":
+    """Return the files that `write_mesh` writes.
+
+    These are `out`, of a textured mesh the image of what views saw, and of a textured OBJ its material and its image.
+    """
+    if not textured:
         return (out,)
     stem = "_".join(out.stem.split())  # many programs take spaces for the end of a name
-    return out, out.with_name(f"{stem}.mtl"), out.with_name(f"{stem}.png")
+    seen = out.with_name(f"{stem}_seen.png")
+    if out.suffix.lower() != ".obj":
+        return out, seen
+    return out, seen, out.with_name(f"{stem}.mtl"), out.with_name(f"{stem}.png")
 
 
 def write_mesh(
@@ -76,7 +82,8 @@ def write_mesh(
 
     Args:
         model: the mesh.
-        out: file to write; missing folders are created. A textured OBJ also has an MTL and a PNG file.
+        out: file to write; missing folders are created. A textured OBJ also has an MTL and a PNG file, and textured
+            meshes an image NAME_seen.png: white where views saw the texture, black where its colours are filled in.
         texture: for OBJ and GLB, in place of vertex colours.
         object_from_upright: (3, 3) right, down and forward of the view in which a GLB is shown; None: the camera's own;
             `AS_GIVEN`: the node of a GLB does not turn the mesh.
@@ -86,12 +93,14 @@ def write_mesh(
     suffix = format_of(out)
     if texture is not None and suffix not in TEXTURED:
         raise InputError(f"{out}: {suffix[1:]} has no textures; use {' or '.join(TEXTURED)}, or leave out the texture")
+    if texture is not None:
+        write_atomically(files_of(out, textured=True)[1], encoded(255 * texture.seen.astype(np.uint8), "PNG"))
     match suffix:
         case ".ply":
             write_atomically(out, mesh_ply(model))
         case ".obj":
             if texture is not None:
-                _, material, image = files_of(out, textured=True)
+                _, _, material, image = files_of(out, textured=True)
                 write_atomically(image, encoded(texture.image, "PNG"))
                 write_atomically(material, _material(image.name))
             write_atomically(out, _obj(model, "_".join(out.stem.split()), texture, f"{unit}, {axes}"))
@@ -306,8 +315,9 @@ TRIANGLES = 8_000  # of a mesh whose detail is in the image, at most
 _FILLED = 0.6  # share of the image that charts fill
 PIECE = 1_000  # triangles that are unwrapped at once: the time grows with more than the square of their number
 
-Paint = Callable[[Array, Array, npt.NDArray[np.uint8]], npt.NDArray[np.uint8]]
-"""From points (n, 3) and normals (n, 3) in the object frame, and RGB (n, 3) of the vertices there, to RGB (n, 3)."""
+Paint = Callable[[Array, Array, npt.NDArray[np.uint8]], tuple[npt.NDArray[np.uint8], BoolArray]]
+"""From points (n, 3) and normals (n, 3) in the object frame, and RGB (n, 3) of the vertices there, to RGB (n, 3) and
+whether views saw it (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,6 +328,8 @@ class Texture:
     """(v, 2) places in the image, 0..1: u to the right, v upwards from the lower edge."""
     image: npt.NDArray[np.uint8]
     """(h, w, 3) RGB."""
+    seen: BoolArray
+    """(h, w) whether a view with colour saw the surface there; elsewhere its colours are filled in from around."""
     texel_m: float
     """Side of a pixel of the image on the surface."""
 
@@ -358,8 +370,9 @@ def textured(model: ObjectModel, paint: Paint, side_px: int) -> tuple[ObjectMode
     )
     packed = max(atlas.width, atlas.height)
     shares = places.astype(np.float64) * np.array([atlas.width, atlas.height]) / packed
-    image = _baked(wrapped, shares * side_px, side_px, paint)
-    return wrapped, Texture(np.stack([shares[:, 0], 1.0 - shares[:, 1]], axis=1), image, texel_m * packed / side_px)
+    image, seen = _baked(wrapped, shares * side_px, side_px, paint)
+    uv = np.stack([shares[:, 0], 1.0 - shares[:, 1]], axis=1)
+    return wrapped, Texture(uv, image, seen, texel_m * packed / side_px)
 
 
 def _pieces(centres_m: Array, most: int) -> list[npt.NDArray[np.int64]]:
@@ -376,8 +389,10 @@ def _pieces(centres_m: Array, most: int) -> list[npt.NDArray[np.int64]]:
     return pieces
 
 
-def _baked(model: ObjectModel, places_px: Array, side_px: int, paint: Paint) -> npt.NDArray[np.uint8]:
+def _baked(model: ObjectModel, places_px: Array, side_px: int, paint: Paint) -> tuple[npt.NDArray[np.uint8], BoolArray]:
     """Return the image (s, s, 3): every pixel in or next to a chart shows the point of the surface nearest to it.
+
+    And which pixels (s, s) show what views saw.
 
     Args:
         model: the mesh.
@@ -399,7 +414,9 @@ def _baked(model: ObjectModel, places_px: Array, side_px: int, paint: Paint) -> 
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     at_vertices = np.full_like(model.vertices_m, 128.0) if model.vertex_colours is None else model.vertex_colours
     between = np.rint(np.einsum("nk,nkc->nc", shares, at_vertices[triangle])).astype(np.uint8)
-    colours = paint(points, normals, between)
+    colours, known = paint(points, normals, between)
+    seen = np.zeros(len(pixels), dtype=bool)
+    seen[near] = known
     image = np.full((len(pixels), 3), np.rint(colours.mean(axis=0)) if len(colours) else 128, dtype=np.uint8)
     image[near] = colours
-    return image.reshape(side_px, side_px, 3)
+    return image.reshape(side_px, side_px, 3), seen.reshape(side_px, side_px)

@@ -192,8 +192,10 @@ class FusionVolume:
         """Return what the views observe at oriented points (n, 3) of the object frame."""
         return self._support(points_m, normals, self.exposure)
 
-    def texture_colours(self, points_m: Array, normals: Array, unseen: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views.
+    def texture_colours(
+        self, points_m: Array, normals: Array, unseen: npt.NDArray[np.uint8]
+    ) -> tuple[npt.NDArray[np.uint8], BoolArray]:
+        """Return the RGB (n, 3) of surface points (n, 3) from the most frontal and sharpest views, and which they see.
 
         Args:
             points_m: (n, 3) in the object frame.
@@ -201,7 +203,7 @@ class FusionVolume:
             unseen: (n, 3) RGB of those that no view with colour sees.
         """
         found = self._support(points_m, normals, self.exposure, focus=SHARP)
-        return np.where(found.coloured[:, None], found.colours, unseen)
+        return np.where(found.coloured[:, None], found.colours, unseen), found.coloured
 
     @property
     def pixel_m(self) -> float:

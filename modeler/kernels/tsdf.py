@@ -19,6 +19,7 @@ from modeler.kernels.threads import over_rows
 from modeler.kernels.votes import SAME_SIDE, above, facing, fuse_votes, project, towards
 
 SIDE = 4  # voxels along the side of a block
+HIGHLIGHT = 0.1  # scale of the Cauchy weights on log brightness above the median of the views; as `COLOUR_SIGMA`
 
 
 @njit(cache=True)
@@ -170,7 +171,7 @@ def observe(queries, directions, tolerance_m, tau_m, *views):
     """Return the observations of oriented points by the views (eq. 12.7, 12.8 and 12.10).
 
     A view supports a point if it sees a surface within `tolerance_m` along the same pixel that faces the same way.
-    Colours are averaged over the supporting views.
+    Colours are averaged over the supporting views; those brighter than the weighted median count less, as highlights.
 
     Args:
         queries: (n, 3) in the object frame.
@@ -212,9 +213,11 @@ def _observe(
 ):
     frames, height, width = index.shape
     observed, colours = np.zeros((len(queries), 6)), np.zeros((len(queries), 4))
+    shown, levels, shares = np.empty((frames, 3)), np.empty(frames), np.empty((frames, 2))
     directions = queries[:, 3:]
     for q in range(len(queries)):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        count = 0
         for f in range(frames):
             u, v, depth = project(poses[f], intrinsics[f], x, y, z)
             column, row = math.floor(u + 0.5), math.floor(v + 0.5)
@@ -238,18 +241,38 @@ def _observe(
             left, top = math.floor(u), math.floor(v)
             if gains[f, 3] == 0.0 or left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
                 continue
-            share = gains[f, 3] * colour_weights[n] ** focus  # eq. 12.10
-            colours[q, 3] += share
+            shares[count, 0] = gains[f, 3] * colour_weights[n]
+            shares[count, 1] = gains[f, 3] * colour_weights[n] ** focus  # eq. 12.10
             turned = harmonics(poses[f], normals[n, 0], normals[n, 1], normals[n, 2])
+            levels[count] = 1.0
             for c in range(3):
                 shade = 0.0
                 for h in range(HARMONICS):
                     shade += shading[h, c] * turned[h]
-                colours[q, c] += share * gains[f, c] * math.exp(shade) * between(colour[f], u, v, c)
+                shown[count, c] = gains[f, c] * math.exp(shade) * between(colour[f], u, v, c)
+                levels[count] += shown[count, c]
+            count += 1
+        usual = _weighted_median(levels[:count], shares[:count, 0])
+        for k in range(count):
+            share = shares[k, 1] / (1.0 + (max(0.0, math.log(levels[k] / usual)) / HIGHLIGHT) ** 2)
+            colours[q, 3] += share
+            for c in range(3):
+                colours[q, c] += share * shown[k, c]
         if colours[q, 3] > 0.0:
             for c in range(3):
                 colours[q, c] = min(255.0, colours[q, c] / colours[q, 3])
     return observed, colours
+
+
+@njit(cache=True, nogil=True)
+def _weighted_median(values, weights):
+    """Return the least of values (n,) up to which lies half of their weight (n,); 1 if there are none."""
+    order, total, below = np.argsort(values), 0.5 * weights.sum(), 0.0
+    for k in order:
+        below += weights[k]
+        if below >= total:
+            return values[k]
+    return 1.0
 
 
 @njit(cache=True)

@@ -108,7 +108,7 @@ def compared(
     shown_m, unseen = scene.of(drawn, mesh[0]), np.zeros(normals.shape, dtype=np.uint8)
     matched[drawn.hit] &= volume.support(shown_m, normals).coloured
     painted = np.zeros((*drawn.hit.shape, 3))
-    painted[drawn.hit] = volume.texture_colours(shown_m, normals, unseen)
+    painted[drawn.hit], _ = volume.texture_colours(shown_m, normals, unseen)
     lamps = np.ones(painted.shape)
     lamps[drawn.hit] = np.exp(-harmonics_of(normals @ object_from_camera[:3, :3], np.eye(4)) @ volume.exposure.shading)
     for name, shown in (("", painted), ("_lit", painted * lamps)):
