@@ -285,6 +285,17 @@ def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
         assert Closer().judge_span(witnessed(true, -1e9), run.map_view).accepted
 
 
+def test_views_that_failed_to_join_the_previous_one_are_tried_again_once_the_graph_predicts_their_motion() -> None:
+    run = Run(list(REGULAR_DEG))
+    run.run(Closer(max_closures=0))
+    joined = run.judged[6][0]
+    assert (6, 5) not in Closer().span_pairs(run.map_view)
+    for reason, tried in ((Failed(Outcome.AT_LIMIT), True), (NotPlaced(), False)):
+        rejected = replace(joined, accepted=False, reason=reason)
+        pairs = Closer().span_pairs(replace(run.map_view, edges=(*run.graph.edges, rejected)))
+        assert ((6, 5) in pairs) == tried
+
+
 def test_frames_lost_at_the_end_do_not_keep_spans_from_being_tried() -> None:
     run = Run(list(REGULAR_DEG))
     run.run(Closer(max_closures=0))

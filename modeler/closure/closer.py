@@ -18,6 +18,7 @@ from modeler.types import (
     NEAR_DEG,
     Edge,
     EdgeKind,
+    Failed,
     NotPlaced,
     PoseGaussian,
     Posterior,
@@ -111,12 +112,18 @@ class Closer:
         """Return the most informative pairs (source, target) of each view to register once all are in.
 
         Both are of one segment, as there is no motion prior between segments. The last view of a segment is paired with
-        the first if that is within reach.
+        the first if that is within reach, and each with the one before if their registration failed: now the graph
+        predicts the motion, which exceeded the prior's limits or was not found.
         """
         segment_of = segments([edge for edge in map_view.edges if map_view.solution.takes_part(edge)])
         frames, targets = sorted(map_view.frames), np.array(sorted(map_view.targets))
         poses = map_view.poses(targets.tolist())
         tried = {frozenset((edge.source, edge.target)) for edge in map_view.edges}
+        failed = {
+            frozenset((edge.source, edge.target))
+            for edge in map_view.edges
+            if edge.kind == "odometry" and isinstance(edge.reason, Failed)
+        }
         ends = {*{segment_of.get(frame): frame for frame in frames}.values()}
         segment = np.array([segment_of.get(int(target), -1) for target in targets], dtype=np.int64)
         pairs: list[tuple[int, int]] = []
@@ -132,6 +139,9 @@ class Closer:
             near = [k for k in np.flatnonzero(angle_deg <= self.max_span_deg) if {source, earlier[k]} not in tried]
             found = gain.candidates([earlier[k] for k in near], angle_deg[near], self.min_span_gain_nats)
             chosen = [one.frame for one in found if one.overlap >= self.thresholds.min_overlap]
+            before = earlier[-1] if earlier else None
+            if frozenset((source, before)) in failed:
+                chosen = [before, *(frame for frame in chosen if frame != before)]
             untried = source in ends and len(earlier) > 0 and {source, earlier[0]} not in tried
             if untried and self._returns(gain, source, earlier[0], float(angle_deg[0])):
                 chosen = [earlier[0], *chosen]
