@@ -129,6 +129,24 @@ def test_it_draws_no_more_than_it_may_and_states_its_effective_size() -> None:
     assert found.effective_samples < 100.0
 
 
+@pytest.mark.parametrize(("roughness_nats", "usable"), [(3.0, True), (8.0, False)])
+def test_a_rough_likelihood_determines_its_mode_less_precisely(roughness_nats: float, usable: bool) -> None:
+    """Differences between neighbouring poses that are chance leave few samples; tempered, they are about the mode."""
+    images, noise = gaussian(ABOUT, SIGMAS), np.random.default_rng(7)
+
+    def rough(poses: Array) -> Array:
+        return images.log_density(poses) + roughness_nats * noise.normal(size=len(poses))
+
+    found = AdaptiveSampler(max_draws=3000).run(
+        Around(SIGMAS, evidence=False), known(rough), CENTRE_M, np.random.default_rng(0)
+    )
+    assert (found.effective_samples >= 100.0) == usable
+    if usable:
+        mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)
+        np.testing.assert_allclose(se3.difference(ABOUT, mean, CENTRE_M) / SIGMAS, 0.0, atol=0.6)
+        assert 0.7 < np.mean(np.diag(covariance) / SIGMAS**2) < 2.2
+
+
 def test_the_likelihood_is_called_only_inside_the_support_and_an_empty_support_is_no_evidence() -> None:
     class Nowhere(Around):
         def log_prior(self, target_from_source: Array) -> Array:

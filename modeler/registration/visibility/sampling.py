@@ -31,6 +31,8 @@ _PER_ROUND = 4  # a round draws a quarter of the samples so far, or more: it goe
 _EM_STEPS, _MEAN_STEPS = 4, 2  # proposals need no convergence
 _MIN_PART = 0.05  # of the weight: the few samples of a smaller part do not determine a Gaussian
 _WHITE_FLOOR = 1e-4  # of variances in whitened coordinates
+_LEAST_POWER = 0.5  # of the weights of a result: variances are at most doubled
+_TEMPERED = 1.2  # times the effective size that a usable result needs, as thinning takes a little
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +216,8 @@ class AdaptiveSampler:
 
     Each round draws from a Gaussian with the moments of the weighted samples so far. All samples are weighted against
     the mixture of all proposals, so that a bad one costs samples, not correctness. While the weights are too uneven to
-    determine a covariance, they are tempered for the next proposal, which has two Gaussians. Proposals are defensive
-    mixtures.
+    determine a covariance, they are tempered for the next proposal, which has two Gaussians, and at the end for the
+    result, if a power of at least a half is enough. Proposals are defensive mixtures.
     """
 
     draws: int = 200
@@ -275,7 +277,10 @@ class AdaptiveSampler:
             log_density = np.logaddexp(log_count + proposal.log_density(poses), fitted.log_density(poses))
             drawn = drawn.reweighted(new).plus(weighted(poses, log_density))
             log_weights = drawn.log_weights
-        chosen, weights = thinned(normalised(log_weights), self.samples, rng)
+        # A likelihood that is rough, as noise makes it, leaves few samples: they say where the mode is, not how narrow.
+        power = _power(log_weights, _TEMPERED * self.min_effective) if effective < self.min_effective else 1.0
+        tempered = power * log_weights if power >= _LEAST_POWER else log_weights
+        chosen, weights = thinned(normalised(tempered), self.samples, rng)
         return WeightedSamples(
             drawn.poses[chosen],
             weights,
