@@ -56,6 +56,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "trust": ("reliability of exit status 0, with and without faults", "20 minutes a core"),
     "turned_over": ("objects that are turned over within one recording", "half an hour"),
     "whole": ("models of captures that another renderer makes, every factor drawn at random", "half an hour a core"),
+    "whole.ceiling": ("the same, with true motions and masks given to runs that were wrong or refused", "half an hour"),
     "whole.things": ("gather the meshes and photographs of packages that `whole` shows", "a minute"),
 }
 """What each measures, and roughly how long it takes with its defaults."""

@@ -161,7 +161,7 @@ def _spreads_at_rim(depths_m: Sequence[Float32Array], camera: Camera, noise: Dep
     quarters = [(np.float32(share) * (readings - 1)).round().astype(np.int64) for share in (0.25, 0.5, 0.75)]
     low, middle, high = (np.take_along_axis(stack, place[None], axis=0)[0][often] for place in quarters)
     apart = 2.0 * ndtri(0.75)  # standard deviations from the lower to the upper quartile of a Gaussian
-    return (high - low) / (apart * noise.sigma_m(middle)), np.count_nonzero(_rim(often.shape))
+    return (high - low) / (apart * noise.sigma_m(middle)), int(np.count_nonzero(_rim(often.shape)))
 
 
 def noise_within(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:

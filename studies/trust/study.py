@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Final, Protocol, final
 
 import numpy as np
@@ -17,7 +17,7 @@ from modeler.evaluation import TrueSurface, align_to_model, rotation_error_deg, 
 from modeler.export.report import RunMeta, report_of
 from modeler.sequences import AbstractSequence
 from modeler.sequences.meshes import Mesh
-from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel, Step
+from modeler.types import AbstractRegistrar, Array, BoolArray, Frame, InputError, ObjectModel, Step
 from studies.trust.plan import Half, Plan
 from studies.trust.stage import Recorded
 
@@ -144,13 +144,25 @@ def outcome(plan: Plan, look: Look = lambda plan, recorded, step: None) -> Outco
     )
 
 
-def built(recorded: AbstractSequence, options: PriorOptions, seed: int) -> tuple[Step, dict[str, Any]]:
+def built(
+    recorded: AbstractSequence,
+    options: PriorOptions,
+    seed: int,
+    registrar: Callable[[AbstractRegistrar], AbstractRegistrar] = lambda method: method,
+) -> tuple[Step, dict[str, Any]]:
     """Build a model as `modeler build` does, without recording, and return the last step and the report.
+
+    Args:
+        recorded: the sequence.
+        options: what is known of the motion.
+        seed: of the registration.
+        registrar: returns what registers pairs in place of the method.
 
     Raises:
         InputError: if the input cannot be used.
     """
     modeler = compose.modeler(recorded, options, MethodOptions(seed=seed), ObjectOptions())
+    modeler = replace(modeler, registrar=registrar(modeler.registrar))
     scene = compose.scene(modeler, recorded)
     closes = comes_back(recorded, modeler.prior, modeler.closer.max_angle_deg)
     *_, last = modeler.run(recorded, scene, closure_expected=closes)

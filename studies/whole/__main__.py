@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Final
 
 from studies.results.tables import FOLDER, record
-from studies.results_file import earlier_results
 from studies.side_by_side import results
 from studies.whole.plan import HALVES, Plan
-from studies.whole.study import Outcome, outcome
+from studies.whole.study import earlier, outcome
 from studies.whole.tables import counts, text
 
 CAPTURES: Final = 160
@@ -52,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.only is None or number in options.only
     ]
     path = options.out / f"{options.half}.jsonl"
-    done = {one.number: one for one in map(Outcome.of, map(json.loads, earlier_results(path)))}
+    done = earlier(path)
     missing = [plan for plan in plans if plan.number not in done]
     work = [partial(outcome, options.things, plan) for plan in missing]
     began = time.perf_counter()

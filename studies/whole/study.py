@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -15,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.evaluation import TrueSurface
-from modeler.types import Array, InputError, Step
+from modeler.types import AbstractRegistrar, Array, InputError, Step
 from studies.multiplied.judged import MAX_DEG, apart
+from studies.results_file import earlier_results
 from studies.trust.study import built
 from studies.whole.capture import Capture
 from studies.whole.plan import Factors, Half, Plan
@@ -79,24 +81,38 @@ class Outcome:
         return Outcome(**{**fields, "factors": Factors(**values["factors"])})
 
 
+def earlier(path: Path) -> dict[int, Outcome]:
+    """Return the outcomes that a file holds, by number; none if there is no file."""
+    return {one.number: one for one in map(Outcome.of, map(json.loads, earlier_results(path)))}
+
+
 Look = Callable[[Capture, Step | None], None]
 
 
-def outcome(path: Path, plan: Plan, look: Look = lambda capture, step: None) -> Outcome:
+def outcome(
+    path: Path,
+    plan: Plan,
+    look: Look = lambda capture, step: None,
+    *,
+    drawn: Callable[[Factors], Factors] = lambda factors: factors,
+    registrar: Callable[[Capture, AbstractRegistrar], AbstractRegistrar] = lambda capture, method: method,
+) -> Outcome:
     """Build the model of a capture as `modeler build` does, without recording, and compare it with the truth.
 
     Args:
         path: of the meshes and photographs.
         plan: of the capture.
         look: receives the capture and the last step; None if the input was refused.
+        drawn: returns the factors in place of those of the plan.
+        registrar: returns what registers pairs of the capture in place of the method.
     """
     things, pictures = _read(path)
-    capture = Capture(plan.factors(things, len(pictures)), plan.seed, things, pictures)
+    capture = Capture(drawn(plan.factors(things, len(pictures))), plan.seed, things, pictures)
     capture.frame(0)  # renders all, so that the time is the run's
     began = time.perf_counter()
     step, report = None, {}
     try:
-        step, report = built(capture, capture.options(), plan.seed)
+        step, report = built(capture, capture.options(), plan.seed, partial(registrar, capture))
     except InputError as error:
         report = {"trustworthy": False, "reason_codes": [f"refused: {error}"], "reasons": [str(error)], "evidence": {}}
     seconds = time.perf_counter() - began
