@@ -30,10 +30,11 @@ def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         raise InputError(f"{path}: is no complete {what} ({short_message(error, path)}); copy all of it.") from None
-    except OSError as error:
-        why = error.strerror or short_message(error, path)
-        raise InputError(f"{path}: cannot be read ({why}); check the path and its permissions.") from None
-    except Exception as error:  # a broken file can make a library raise anything
+    except Exception as error:  # a broken file can make a library raise anything, an OSError of its own, too
+        if isinstance(error, OSError) and error.errno is not None:
+            raise InputError(
+                f"{path}: cannot be read ({error.strerror}); check the path and its permissions."
+            ) from None
         raise InputError(f"{path}: is not a readable {what} ({short_message(error, path)}); {advice}.") from None
 
 
