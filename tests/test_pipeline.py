@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -454,9 +453,7 @@ def test_lost_frames_join_after_all_where_later_views_place_them() -> None:
     assert [step.last for step in steps] == [False] * 13 + [True]
     assert set(steps[-1].views) == set(steps[-1].solution.trajectory) == set(range(9))
     assert steps[-1].model is not None
-    registered = Counter((edge.source, edge.target) for edge in steps[-1].edges_so_far)
-    failed = {(edge.source, edge.target) for edge in steps[-1].edges_so_far if isinstance(edge.reason, Failed)}
-    assert {pair for pair, count in registered.items() if count > 1} == {(3, 2)} <= failed  # again by the graph
+    assert len({(e.source, e.target) for e in steps[-1].edges_so_far}) == len(steps[-1].edges_so_far)
     assert trajectory_error(steps[-1]) < 1e-6
 
 

@@ -139,9 +139,7 @@ class Closer:
             near = [k for k in np.flatnonzero(angle_deg <= self.max_span_deg) if {source, earlier[k]} not in tried]
             found = gain.candidates([earlier[k] for k in near], angle_deg[near], self.min_span_gain_nats)
             chosen = [one.frame for one in found if one.overlap >= self.thresholds.min_overlap]
-            before = earlier[-1] if earlier else None
-            if frozenset((source, before)) in failed:
-                chosen = [before, *(frame for frame in chosen if frame != before)]
+            chosen = [frame for frame in earlier[-1:] if {source, frame} in failed] + chosen
             untried = source in ends and len(earlier) > 0 and {source, earlier[0]} not in tried
             if untried and self._returns(gain, source, earlier[0], float(angle_deg[0])):
                 chosen = [earlier[0], *chosen]

@@ -80,11 +80,19 @@ class State:
         return 1 if other is None else abs(self.places[frame] - self.places[other])
 
     def read(self, prepared: Prepared) -> State:
-        """Return the state after reading one more frame."""
+        """Return the state after reading one more frame.
+
+        Raises:
+            InputError: if its number is that of an earlier one.
+        """
         return replace(self, places={**self.places, self._new(prepared): len(self.places)})
 
     def inserted(self, prepared: Prepared) -> State:
-        """Return the state after reading a frame that was skipped: its number decides its place among the others."""
+        """Return the state after reading a frame that was skipped: its number decides its place among the others.
+
+        Raises:
+            InputError: if its number is that of an earlier one.
+        """
         frames = sorted([*self.places, self._new(prepared)])
         return replace(self, places={frame: place for place, frame in enumerate(frames)})
 
@@ -124,9 +132,12 @@ class State:
         return replace(self, spans=(*self.spans, *edges))
 
     def with_spans(self) -> State:
-        """Return the state with the edges of the refinement in its graph."""
+        """Return the state with the edges of the refinement in its graph, in place of rejected ones of the pairs."""
         known = set(self.graph.edges)
-        graph = self.graph.plus([edge for edge in self.spans if edge not in known])
+        new = [edge for edge in self.spans if edge not in known]
+        again = {(edge.source, edge.target) for edge in new}
+        kept = [edge for edge in self.graph.edges if edge.accepted or (edge.source, edge.target) not in again]
+        graph = PoseGraph((*kept, *new), self.graph.first)
         return replace(self, graph=graph, smoother=self.smoother.to(graph))
 
     def lost_intervals(self) -> list[list[int]]:
