@@ -131,9 +131,8 @@ class ModelRenderer:
 
     def around(self, camera_from_model: Array, camera: Camera, radii: float) -> tuple[slice, slice]:
         """Return the rows and columns of an image within some radii of the model in a pose (4, 4), maybe none."""
-        x, y, z = se3.transform(camera_from_model, self.centre_m[None])[0]
-        near_m = max(z - self.radius_m, 0.2 * self.radius_m)
-        z, reach = max(z, near_m), radii * self.radius_m / near_m
+        (x, y, z), near_m = self._place(camera_from_model)
+        reach = radii * self.radius_m / near_m
         rows, columns = (
             slice(*np.clip([focal * (at - reach) + middle, focal * (at + reach) + middle + 1.0], 0, size).astype(int))
             for at, focal, middle, size in (
@@ -143,13 +142,17 @@ class ModelRenderer:
         )
         return rows, columns
 
-    def _cropped(self, camera_from_model: Array, camera: Camera, most_px: float) -> tuple[Camera, float]:
-        """Return the part of a camera's image around the model, at most so fine as is of use, and its pixels' width."""
+    def _place(self, camera_from_model: Array) -> tuple[tuple[float, float, float], float]:
+        """Return the model's middle before the camera in a pose (4, 4), and the depth of what is nearest, in m."""
         x, y, z = se3.transform(camera_from_model, self.centre_m[None])[0]
         near_m = max(z - self.radius_m, 0.2 * self.radius_m)
+        return (x, y, max(z, near_m)), near_m
+
+    def _cropped(self, camera_from_model: Array, camera: Camera, most_px: float) -> tuple[Camera, float]:
+        """Return the part of a camera's image around the model, at most so fine as is of use, and its pixels' width."""
+        (x, y, z), near_m = self._place(camera_from_model)
         across, down = (2.0 * self.radius_m * focal / near_m for focal in (camera.fx, camera.fy))
         step = max(max(across, down) / most_px, 1.0)
-        z = max(z, near_m)
         left, top = (
             camera.fx * x / z + camera.cx - (0.5 + _MARGIN) * across,
             camera.fy * y / z + camera.cy - (0.5 + _MARGIN) * down,
