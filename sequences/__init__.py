@@ -30,7 +30,11 @@ from modeler.types import InputError
 
 
 def bundled(name: str) -> Path:
-    """Return the folder of a sequence that comes with the package: `box`, `flashlight` or `tube`."""
+    """Return the folder of a sequence that comes with the package: `box`, `flashlight` or `tube`.
+
+    Raises:
+        InputError: if there is none of that name.
+    """
     folder = Path(__file__).parent / "bundled"
     names = sorted(path.name for path in folder.iterdir() if path.is_dir())
     if name not in names:

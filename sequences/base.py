@@ -39,6 +39,9 @@ class AbstractSequence(ABC):
         """Return the true camera_from_model (4, 4), in m, by frame number; None if it is not known.
 
         Frames whose truth is not known are left out.
+
+        Raises:
+            InputError: if the ground truth cannot be read.
         """
         return None
 
@@ -106,6 +109,9 @@ class AbstractSequence(ABC):
         Args:
             every: stride over the frames.
             frames: keep frame numbers from `start` up to but not including `stop`.
+
+        Raises:
+            InputError: if nothing is left.
         """
         check_every(every)
         start, stop = (None, None) if frames is None else (frames.start, frames.stop)
@@ -200,7 +206,11 @@ class AbstractLive(AbstractSequence):
         return replace(self, stop=stop)
 
     def select(self, every: int = 1, frames: slice | None = None) -> Self:
-        """Return a part of the sequence, of present and future frames."""
+        """Return a part of the sequence, of present and future frames.
+
+        Raises:
+            InputError: if `every` keeps nothing.
+        """
         check_every(every)
         return replace(self, every=self.every * every, kept=self.kept if frames is None else frames)
 
@@ -244,6 +254,9 @@ class GivenSequence(AbstractSequence):
         Args:
             frames: in order of time.
             live: take only the first frames, from which the scene is learned, and each other one when it is asked for.
+
+        Raises:
+            InputError: if there is none, one is no frame, or their numbers do not ascend.
         """
         coming = _checked(frames)
         given = tuple(itertools.islice(coming, FIRST if live else None))
@@ -319,13 +332,21 @@ def _size_bytes(frame: Frame) -> int:
 
 
 def check_every(every: int) -> None:
-    """Check a stride."""
+    """Check a stride.
+
+    Raises:
+        InputError: if it is less than 1.
+    """
     if every < 1:
         raise InputError(f"`every` {every} keeps no frame; give a whole number of at least 1.")
 
 
 def frame_range(text: str) -> slice:
-    """Read a range of frame numbers `A:B`, half-open; either end may be left out."""
+    """Read a range of frame numbers `A:B`, half-open; either end may be left out.
+
+    Raises:
+        InputError: if the text is no such range.
+    """
     match = re.fullmatch(r"([0-9]{0,18}):([0-9]{0,18})", text.strip())
     if match is None:
         raise InputError(f"`frames` {text[:99]!r} is not a range of frame numbers; write A:B, for instance 0:14.")

@@ -298,6 +298,9 @@ def write_bop(
         depth_scale_mm: millimetres per unit of depth; with 0.1 depth reaches to 6.55 m.
         colour_suffix: `.png`, or `.jpg` for small files.
         files: more files by name, such as `model.ply` and `robot.txt`.
+
+    Raises:
+        InputError: if the folder is not empty or cannot be written, or depth does not fit into 16 bits.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

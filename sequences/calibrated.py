@@ -74,7 +74,11 @@ def slope_terms(distance_m: Array, angle_rad: Array) -> Array:
 
 
 def read_noise(path: Path) -> NoiseModel:
-    """Read a model that `modeler calibrate-sensor` has stored."""
+    """Read a model that `modeler calibrate-sensor` has stored.
+
+    Raises:
+        InputError: if it is missing or says something else.
+    """
     node = read_tree(path).need("noise")
     growth = node.need("growth").elements()
     if len(growth) != 3:
@@ -168,7 +172,11 @@ class FocalFactor:
 
 
 def read_focal_factor(path: Path) -> FocalFactor:
-    """Read a factor that `modeler calibrate-camera` has stored."""
+    """Read a factor that `modeler calibrate-camera` has stored.
+
+    Raises:
+        InputError: if the file is missing or says something else.
+    """
     node = read_tree(path)
     return FocalFactor(
         node.need("focal_factor").number(0.5, 2.0),

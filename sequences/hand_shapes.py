@@ -78,7 +78,11 @@ class HandMarkedSequence(AbstractDerived):
     poses: HandPoses
 
     def frame(self, index: int) -> Frame:
-        """Return a frame with the hand marked."""
+        """Return a frame with the hand marked.
+
+        Raises:
+            InputError: if the hand's pose is not known, too.
+        """
         frame = self.whole.frame(index)
         marks = self.shape.marked(frame, self.poses.at(frame)[0])
         return replace(frame, occluder=marks if frame.occluder is None else marks | frame.occluder)

@@ -123,7 +123,11 @@ class Survey:
         return tuple(found)
 
     def check(self, name: str, *, despite_doubts: bool = False) -> None:
-        """Refuse a sequence with a plain error, unless asked not to."""
+        """Refuse a sequence with a plain error, unless asked not to.
+
+        Raises:
+            InputError: if it has one.
+        """
         if self.plain_errors and not despite_doubts:
             raise InputError(f"{name}: {self.plain_errors[0]} (or `despite_doubts`)")
 
@@ -170,6 +174,10 @@ def survey(sequence: AbstractSequence, *, truth: bool = True) -> Survey:
     Args:
         sequence: to inspect.
         truth: whether to read the ground truth too; estimation must not.
+
+    Raises:
+        InputError: if a frame or the ground truth cannot be read, none measures anything, all masks are empty, or
+            the depth cannot be in its given unit.
     """
     cameras: dict[Camera, None] = {}
     times_s, ranges, shares, joined, noises, farthest_m = [], [], [], [], [], 0.0

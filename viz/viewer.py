@@ -82,7 +82,11 @@ class Viewer:
 
 
 def start_window(recordings: Sequence[Path] = ()) -> Viewer:
-    """Open the viewer in a window that outlives this process, showing the given recordings."""
+    """Open the viewer in a window that outlives this process, showing the given recordings.
+
+    Raises:
+        InputError: if there is no display, or the viewer does not start.
+    """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
             "cannot open the viewer: no display (DISPLAY is not set); use `web` and open the page that it prints"
@@ -94,7 +98,11 @@ def start_window(recordings: Sequence[Path] = ()) -> Viewer:
 
 
 def start_web(recording: Path | None = None) -> Viewer:
-    """Serve the viewer in the browser on 127.0.0.1 for as long as this process lives, showing the given recording."""
+    """Serve the viewer in the browser on 127.0.0.1 for as long as this process lives, showing the given recording.
+
+    Raises:
+        InputError: if the server does not start.
+    """
     port, page = _free_port(), _free_port()
     arguments = ["--serve-web", "--port", str(port), "--web-viewer-port", str(page)]
     process = _start(arguments, port=page, lasting=False)
@@ -111,7 +119,11 @@ def start_web(recording: Path | None = None) -> Viewer:
 
 
 def view(run: Path, *, web: bool = False) -> Viewer:
-    """Show the recording of a run folder in the viewer, in a window or in the browser."""
+    """Show the recording of a run folder in the viewer, in a window or in the browser.
+
+    Raises:
+        InputError: if the folder has no recording, or the viewer does not start.
+    """
     recording = run / "recording.rrd"
     try:
         os.lstat(recording)
@@ -129,7 +141,11 @@ def is_loopback(host: str) -> bool:
 
 
 def reachable(sink: str) -> bool:
-    """Return whether something listens where recordings are to be sent, `rerun+http://HOST:PORT/proxy`."""
+    """Return whether something listens where recordings are to be sent, `rerun+http://HOST:PORT/proxy`.
+
+    Raises:
+        InputError: if the address is not of that form.
+    """
     scheme, _, rest = sink.partition("://")
     place, _, path = rest.partition("/")
     host, _, port = place.rpartition(":")

@@ -241,7 +241,11 @@ class AbstractCloudRegistrar(AbstractRegistrar):
         """
 
     def posterior_of(self, pair: ViewPair) -> Posterior:
-        """Return the fit from the prior's centre; directions that the surfaces leave open have the prior's spread."""
+        """Return the fit from the prior's centre; directions that the surfaces leave open have the prior's spread.
+
+        Raises:
+            InputError: if the views lack what the method compares.
+        """
         began, source, target = time.perf_counter(), pair.source, pair.target
         initial = start(source, target, pair.density, pair.rng)
         fit = self.fit(source, target, initial.target_from_source, pair.rng)

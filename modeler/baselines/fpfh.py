@@ -178,7 +178,11 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
     """The refinement, without coarse levels, which could leave the basin of a good initial pose."""
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
-        """Return the local optimum from KISS-Matcher's motion."""
+        """Return the local optimum from KISS-Matcher's motion.
+
+        Raises:
+            InputError: if KISS-Matcher is not installed.
+        """
         if not kiss_installed():
             raise InputError(KISS_MISSING)
         clouds = Cloud.of(source), Cloud.of(target)

@@ -48,7 +48,11 @@ def usual_workers() -> int:
 
 
 def check_engine(name: str) -> None:
-    """Reject unknown names of engines."""
+    """Reject unknown names of engines.
+
+    Raises:
+        InputError: if it is none.
+    """
     kind, _, what = name.partition(":")
     if name != "processes" and not what:
         raise InputError(

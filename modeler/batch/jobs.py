@@ -163,7 +163,11 @@ def write_note(path: Path, note: dict[str, Any]) -> None:
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open the log of a sequence for appending; what is no regular file there, as a link, is replaced."""
+    """Open the log of a sequence for appending; what is no regular file there, as a link, is replaced.
+
+    Raises:
+        OSError: if it cannot be opened.
+    """
     with suppress(FileNotFoundError):
         if not stat.S_ISREG(os.lstat(path).st_mode):
             path.unlink()
@@ -266,7 +270,11 @@ def run(job: Job) -> Ended | None:
 
 
 def write_failure(job: Job, line: str, status: int = 2) -> Ended:
-    """Record a (further) failure of a job, and return how it ended."""
+    """Record a (further) failure of a job, and return how it ended.
+
+    Raises:
+        OSError: if the note cannot be written.
+    """
     job.note.parent.mkdir(parents=True, exist_ok=True)
     note = read_note(job.note)
     tries = note.get("tries", 0) + 1

@@ -18,7 +18,11 @@ THUMBNAIL_PX = 160  # side of a picture of a model
 
 
 def record_of(run: Path) -> dict[str, Any]:
-    """Return the report, the size of the model and, if known, the errors of a finished run, as JSON values."""
+    """Return the report, the size of the model and, if known, the errors of a finished run, as JSON values.
+
+    Raises:
+        InputError: if the folder holds no run.
+    """
     folder = RunFolder(run)
     report = folder.result()
     record = report_columns(report) | {"sequence": str(folder.located(report["sequence"]))}

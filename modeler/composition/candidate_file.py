@@ -91,7 +91,11 @@ class Pose:
 
 
 def read_candidates(path: Path) -> list[Candidate]:
-    """Return the actions in a file."""
+    """Return the actions in a file.
+
+    Raises:
+        InputError: if it cannot be read or holds none.
+    """
     if path.suffix.lower() == ".csv":
         found = _poses(path)
     else:

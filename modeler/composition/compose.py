@@ -66,7 +66,11 @@ _GUESSES = ("velocity", "features")
 def modeler(
     sequence: AbstractSequence, prior_options: PriorOptions, method: MethodOptions, where: ObjectOptions
 ) -> Modeler:
-    """Return the loop with the parts asked for, its sensor as the sequence describes it, else of unknown noise."""
+    """Return the loop with the parts asked for, its sensor as the sequence describes it, else of unknown noise.
+
+    Raises:
+        InputError: if an option cannot be used.
+    """
     check_region(where, sequence)
     noise, chosen = sequence.sensor(), registrar(method.method, colour=method.colour, device=method.device)
     sensor = Sensor(SensorNoise(sigma_r_m=None, sigma_focal=NOMINAL_FOCAL) if noise is None else noise)
@@ -83,7 +87,11 @@ def modeler(
 
 
 def check_region(where: ObjectOptions, sequence: AbstractSequence) -> None:
-    """Refuse a region that is not part of the image."""
+    """Refuse a region that is not part of the image.
+
+    Raises:
+        InputError: if some of it lies outside the first frame.
+    """
     if where.roi is None:
         return
     camera = sequence.frame(sequence.indices[0]).camera
@@ -113,7 +121,11 @@ def scene(modeler: Modeler, sequence: AbstractSequence, frames: Sequence[int] = 
 def registrar(
     method: Method, *, colour: bool = True, device: Literal["cpu", "cuda"] | None = None
 ) -> AbstractRegistrar:
-    """Return the registration method of a name."""
+    """Return the registration method of a name.
+
+    Raises:
+        InputError: if it cannot be there, or is not installed.
+    """
     if device == "cuda":
         if method != "paper":
             raise InputError(f"`device` cuda: `method` {method} runs on the CPU only; leave `device` out")
@@ -141,7 +153,11 @@ def registrar(
 
 
 def chosen_prior(options: PriorOptions, sequence: AbstractSequence | None) -> AbstractPrior:
-    """Return the requested prior of a sequence, or of several where that is None."""
+    """Return the requested prior of a sequence, or of several where that is None.
+
+    Raises:
+        InputError: if there is no such prior, a parameter cannot be used, or the sequence lacks what it needs.
+    """
     name = prior_name(options, sequence)
     parts = name.split("+")
     for part in parts:

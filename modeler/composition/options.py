@@ -109,7 +109,11 @@ class PriorOptions:
     """Standard deviation of the change of shift from one motion to the next, along each axis (velocity)."""
 
     def given(self, name: str, accepted: Collection[str], of: Mapping[str, Collection[str]]) -> dict[str, Any]:
-        """Return the parameters that were given, by field name."""
+        """Return the parameters that were given, by field name.
+
+        Raises:
+            InputError: if a parameter of another prior was given, or a value that is none.
+        """
         from modeler.types import InputError
         from modeler.types.base import ParameterError, check_parameter
 

@@ -34,6 +34,9 @@ def write_bop(model: ObjectModel, out: Path, place: Placement, more: Mapping[str
         out: PLY file whose name ends in the number of the object (`obj_000001.ply`); without a number it is object 1.
         place: the frame to write it in; BOP's own has the origin in the centre of the box and z up.
         more: further values of the entry.
+
+    Raises:
+        InputError: if the folder is not empty or cannot be written, or depth does not fit into 16 bits.
     """
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: BOP models are PLY files; choose a name such as obj_000001.ply")

@@ -77,7 +77,11 @@ def settle_soon(*paths: Path) -> threading.Thread:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make a folder, if it is not there, and keep other programs that ask for the same out of it."""
+    """Make a folder, if it is not there, and keep other programs that ask for the same out of it.
+
+    Raises:
+        InputError: if it cannot be made, or another program is in it.
+    """
     try:
         str(folder).encode()
         folder.mkdir(parents=True, exist_ok=True)

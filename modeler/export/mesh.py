@@ -41,7 +41,11 @@ def mesh_of(source: Path) -> Path:
 
 
 def format_of(out: Path) -> str:
-    """Return the ending that selects the format."""
+    """Return the ending that selects the format.
+
+    Raises:
+        InputError: if it is none, or the library that writes it is not installed.
+    """
     suffix = out.suffix.lower()
     if suffix not in FORMATS:
         what = f"unknown mesh format {suffix!r}" if suffix else "no suffix selects the mesh format"
@@ -89,6 +93,9 @@ def write_mesh(
             `AS_GIVEN`: the node of a GLB does not turn the mesh.
         axes: description of the axes, for formats with comments.
         unit: of the coordinates as they are given.
+
+    Raises:
+        InputError: if the suffix is unknown or a file cannot be written.
     """
     suffix = format_of(out)
     if texture is not None and suffix not in TEXTURED:

@@ -75,7 +75,11 @@ def fits(row: Mapping[str, Any]) -> bool:
 
 
 def read_table(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a table."""
+    """Return the rows of a table.
+
+    Raises:
+        InputError: if there is none, or it has not these columns.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 

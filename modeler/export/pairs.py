@@ -72,20 +72,32 @@ class Pairs:
         return self.folder.is_dir() and not self.folder.is_symlink()
 
     def mark(self) -> None:
-        """Make the folder."""
+        """Make the folder.
+
+        Raises:
+            OSError: if that cannot be.
+        """
         for folder in (self.folder, self._done):
             if folder.is_symlink():
                 folder.unlink()
         self.folder.mkdir(exist_ok=True)
 
     def empty(self) -> None:
-        """Forget everything; the folder stays."""
+        """Forget everything; the folder stays.
+
+        Raises:
+            OSError: if that cannot be.
+        """
         shutil.rmtree(self._done, ignore_errors=True)
         for file in self.folder.iterdir():
             file.unlink()
 
     def complete(self) -> None:
-        """Move everything to what is of complete runs; the folder goes."""
+        """Move everything to what is of complete runs; the folder goes.
+
+        Raises:
+            OSError: if that cannot be.
+        """
         if self.marked:
             for file in self.folder.iterdir():
                 self._done.mkdir(exist_ok=True)

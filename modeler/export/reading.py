@@ -42,6 +42,9 @@ def read_model(path: Path) -> ObjectModel:
 
     Args:
         path: as `modeler build` writes it; colours, `views` and `sigma_m` where it has them.
+
+    Raises:
+        InputError: if there is none, it cannot be read or has no triangles.
     """
     import trimesh
     from trimesh.visual import ColorVisuals

@@ -71,7 +71,11 @@ class RunFolder:
         return cls(path, len(folder.report()["frames"]) if resumes else 0)
 
     def check(self, *, overwrite: bool = False, resume: bool = False) -> None:
-        """Refuse to make a run where other things are, or, unless asked for, where another run is."""
+        """Refuse to make a run where other things are, or, unless asked for, where another run is.
+
+        Raises:
+            InputError: if that is so.
+        """
         if self.is_empty:
             return
         if not self.is_run:
@@ -83,7 +87,11 @@ class RunFolder:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing would be lost here."""
+        """Whether nothing would be lost here.
+
+        Raises:
+            InputError: if one cannot look.
+        """
         try:
             entries = list(self.path.iterdir()) if self.path.exists() else []
             return not entries or (entries == [self.pairs.folder] and not any(self.pairs.folder.iterdir()))
@@ -144,7 +152,11 @@ class RunFolder:
         return report
 
     def result(self) -> dict[str, Any]:
-        """Return the report after a look at all of it, for whoever relies on more than that it is there."""
+        """Return the report after a look at all of it, for whoever relies on more than that it is there.
+
+        Raises:
+            InputError: if there is none, it cannot be read or is not as `modeler` writes it.
+        """
         report = self.report()
         wrong = fault(report)
         if wrong is not None:
@@ -226,7 +238,11 @@ class RunFolder:
         return report
 
     def finish(self) -> None:
-        """Bring the recording to the disk; take the mark of an unfinished run away unless it ended early."""
+        """Bring the recording to the disk; take the mark of an unfinished run away unless it ended early.
+
+        Raises:
+            InputError: if that cannot be.
+        """
         recording = self.path / _OURS[-1]
         try:
             settle(*(file for file in (recording,) if file.is_file()))

@@ -84,6 +84,9 @@ class Run:
             frames: in order of time.
             live: process each frame before reading the next one, which may only come once somebody has turned the
                 object. Otherwise the next one is prepared meanwhile, and the last is always compared with the first.
+
+        Raises:
+            InputError: if two frames have the same number.
         """
         with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
             coming = map(preparing, frames)
@@ -98,6 +101,9 @@ class Run:
 
         Args:
             frames: in order of time.
+
+        Raises:
+            InputError: if two frames have the same number.
         """
         with prefetching(partial(self.modeler.prepare, scene=self.scene)) as preparing:
             for preparation, _ in with_last(map(preparing, frames)):  # reads one ahead, which is prepared meanwhile

@@ -65,7 +65,11 @@ class PokePrior(AbstractPrior):
         check_parameters(self)
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; after several pushes that of the table prior."""
+        """Return the density of target_from_source; after several pushes that of the table prior.
+
+        Raises:
+            InputError: if neither view shows a plane, no push is given, or it is directed into the plane.
+        """
         earlier, later = sorted((source, target), key=lambda view: view.index)
         pokes = self._between(earlier.index, later.index)
         if len(pokes) > 1:

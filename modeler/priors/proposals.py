@@ -38,7 +38,11 @@ class AbstractProposal(AbstractPrior):
     """The independent knowledge."""
 
     def between(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
-        """Return the density of target_from_source; the independent knowledge alone if there is no proposal."""
+        """Return the density of target_from_source; the independent knowledge alone if there is no proposal.
+
+        Raises:
+            InputError: if the views lack what `known` needs.
+        """
         known = self.known.between(source, target)
         proposal = self.proposal(source, target, known)
         return known if proposal is None else defensive_mixture(known, [proposal])

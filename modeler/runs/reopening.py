@@ -58,7 +58,11 @@ class Part:
         return None if truth is None else {frame + self.offset: pose for frame, pose in truth.items()}
 
     def modeler(self) -> Modeler:
-        """Return the loop with the components and the prior that the run was made with."""
+        """Return the loop with the components and the prior that the run was made with.
+
+        Raises:
+            InputError: if its settings cannot be used.
+        """
         said: dict[str, Any] = {**self.report["settings"], **{name: self.report[name] for name in ("prior", "seed")}}
         settings: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value for name, value in said.items()
@@ -74,6 +78,9 @@ class Part:
 
         Args:
             frames: numbers, its own, of accepted frames.
+
+        Raises:
+            InputError: if the sequence differs from that of the run.
         """
         views, points = {}, {record["id"]: record["points"] for record in self.report["frames"]}
         for frame in frames:
@@ -114,7 +121,11 @@ class Part:
         return modeler, compose.scene(modeler, self.sequence, learned_from)
 
     def check(self) -> None:
-        """Look at the first and the last frame."""
+        """Look at the first and the last frame.
+
+        Raises:
+            InputError: if the sequence differs from that of the run.
+        """
         self.views(sorted({*self.accepted[:1], *self.accepted[-1:]}))
 
 
@@ -124,6 +135,9 @@ def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
     Args:
         run: run folder.
         moved: where the sequences are now, in order; none: where they were.
+
+    Raises:
+        InputError: if a folder holds no run, or a sequence cannot be found.
     """
     places = deque(moved) if moved else None
     found = _parts(run, places, ())

@@ -33,7 +33,11 @@ class TrackFolder:
     """When it may be written again."""
 
     def check(self, *, overwrite: bool) -> None:
-        """Refuse a folder with other contents or, unless asked for, with another track."""
+        """Refuse a folder with other contents or, unless asked for, with another track.
+
+        Raises:
+            InputError: if it is such a one.
+        """
         if not self.path.exists():
             return
         if not self.path.is_dir():

@@ -27,6 +27,9 @@ def check_room(size: int) -> None:
 
     Native code does not report such limits: OpenBLAS retries forever to get its buffers, or ends the process, as Rerun
     does.
+
+    Raises:
+        OSError: if there is too little.
     """
     if sys.platform == "linux":
         mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ).close()
@@ -43,7 +46,11 @@ def install_command(extra: str) -> str:
 
 
 def check_installed(module: str, package: str, extra: str) -> None:
-    """Reject work that needs a package that is not installed."""
+    """Reject work that needs a package that is not installed.
+
+    Raises:
+        InputError: if it is not installed.
+    """
     from modeler.types import InputError  # not with the command line's help
 
     if importlib.util.find_spec(module) is None:

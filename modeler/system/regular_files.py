@@ -53,7 +53,11 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def check_regular(path: Path) -> None:
-    """Reject other than regular files, for libraries that open paths themselves."""
+    """Reject other than regular files, for libraries that open paths themselves.
+
+    Raises:
+        InputError: if it is anything else, missing, or cannot be opened.
+    """
     try:
         open_regular(path).close()
     except OSError as error:
@@ -87,7 +91,11 @@ def left_behind(path: Path, ending: str) -> Iterator[Path]:
 
 
 def read_regular(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
-    """Return the content of a regular file."""
+    """Return the content of a regular file.
+
+    Raises:
+        InputError: if it is anything else, larger than `most_bytes`, missing, or cannot be read.
+    """
     try:
         with open_regular(path) as file:
             size, content = os.fstat(file.fileno()).st_size, None
@@ -102,12 +110,20 @@ def read_regular(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_json(path: Path, most_bytes: int = MAX_BYTES) -> Any:
-    """Return the contents of a JSON file."""
+    """Return the contents of a JSON file.
+
+    Raises:
+        InputError: if it is no regular file, too large, missing, cannot be read, or is not valid JSON.
+    """
     return parse_json(read_regular(path, most_bytes), path)
 
 
 def parse_json(content: str | bytes, path: Path) -> Any:
-    """Return the contents of JSON text; `path` is its source, for messages."""
+    """Return the contents of JSON text; `path` is its source, for messages.
+
+    Raises:
+        InputError: if it is not valid JSON, or nested too deeply.
+    """
     try:
         return json.loads(content)
     except json.JSONDecodeError as error:

@@ -126,11 +126,11 @@ def _fits(value: object, hint: Any) -> bool:
     return not isinstance(wanted, type | tuple) or isinstance(value, wanted)
 
 
-MAX_LENGTH_M: Final = 5.0
+MAX_LENGTH_M: Final = 5.0  # beyond the reach of hands and tables: most larger ones are in mm
 _LIMITS: Final = {"deg": ("degrees", 180.0), "m": ("metres", MAX_LENGTH_M), "s": ("seconds", 1e4)}
 _MAY_BE_ZERO: Final = {"step_sigma_deg", "axis_sigma_deg", "axis_sigma_m", "wobble_deg", "wobble_m"}
-_MAX_TURN_DEG = 360.0
-_MAX_COORDINATE = 100.0
+_MAX_TURN_DEG = 360.0  # a full turn
+_MAX_COORDINATE = 100.0  # in m, or of a direction of any length: most larger ones are in mm
 
 
 class ParameterError(InputError):
@@ -181,13 +181,21 @@ def check_parameter(name: str, value: object, *, exact: bool = True) -> None:
 
 
 def check_parameters(component: Any) -> None:
-    """Check the fields of a dataclass by the units in their names, to be called in `__post_init__`."""
+    """Check the fields of a dataclass by the units in their names, to be called in `__post_init__`.
+
+    Raises:
+        ParameterError: if one is not finite, or out of range.
+    """
     for field in fields(component):
         check_parameter(field.name, getattr(component, field.name))
 
 
 def check_covariance(name: str, covariance: Array) -> None:
-    """Check that a covariance (n, n) is finite, symmetric and positive definite."""
+    """Check that a covariance (n, n) is finite, symmetric and positive definite.
+
+    Raises:
+        InputError: if it is not.
+    """
     valid = np.isfinite(covariance).all() and np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0)
     if not valid or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise InputError(f"{name} is not a covariance; give a finite, symmetric, positive definite matrix")

@@ -351,7 +351,11 @@ class Recipe:
 
 
 def load_recipe(recipe: str | Path) -> Recipe:
-    """Return a recipe from a JSON or TOML file, or a built-in one by its name."""
+    """Return a recipe from a JSON or TOML file, or a built-in one by its name.
+
+    Raises:
+        InputError: if there is no such recipe or it is not understood.
+    """
     path = Path(recipe)
     if not path.is_file() and path.name == str(recipe) and not path.suffix:
         if path.name not in builtin_recipes():

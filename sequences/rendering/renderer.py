@@ -216,7 +216,11 @@ class RenderedSequence(AbstractSequence):
 def render(
     recipe: Recipe, folder: Path, through: Callable[[AbstractSequence], AbstractSequence] = lambda sequence: sequence
 ) -> None:
-    """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`."""
+    """Write the sequence of a recipe as a BOP scene folder, with the true surface as `model.ply`.
+
+    Raises:
+        InputError: if the folder is not empty or cannot be written.
+    """
     sequence = RenderedSequence(recipe)
     files = {"model.ply": ply_bytes(sequence.model())}
     readings = sequence.robot_readings()

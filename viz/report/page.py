@@ -43,6 +43,9 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
         run: the run folder.
         out: file to write.
         truth: camera_from_model (4, 4) by frame number, where it is known.
+
+    Raises:
+        InputError: if the folder holds no run, no frame was accepted, or the file cannot be written.
     """
     result = Result.read(run, truth)
     mesh = read_mesh(run / "model.ply")
