@@ -197,6 +197,19 @@ def test_a_view_of_the_model_serves_wherever_the_object_is_shifted_or_turned_abo
         assert np.allclose(pose, rendered_at if same else turned)
 
 
+def test_an_object_that_jumps_to_and_fro_is_followed() -> None:
+    sequence, model = rendered("boot")
+    renderer, pose, camera = ModelRenderer(model), sequence.truth()[0], sequence.frame(0).camera
+    tracker = Tracker(model, Sensor(sequence.sensor()))
+    for index, outcome in enumerate(("found", "followed", "followed")):
+        jump = se3.translation(np.array([1.0, 0.5, 0.3]) * (index % 2) * 0.7 * renderer.radius_m)  # and back
+        seen, depth_m = renderer.silhouette(jump @ pose, camera)
+        found = tracker.update(Frame(index, 0.5 * index, np.where(seen, depth_m, 0.0), camera, seen))
+        assert found.outcome == outcome
+        assert found.pose is not None
+        assert np.degrees(se3.rotation_angle(se3.inverse(found.pose.mean) @ jump @ pose)) < 1.0
+
+
 def striped(camera_from_model: Array) -> tuple[Frame, ModelRenderer]:
     """A photograph of a wide box with random stripes, and the renderer of its model."""
     box = trimesh.creation.box((0.3, 0.2, 0.1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -220,7 +220,9 @@ class Tracker:
         if self.prior is None:
             seen, rendered = self._shown(expected, view)
             predicted = rendered @ se3.inverse(expected)
-            density: AbstractPoseDensity = _near(view, _STEP_SIGMA_RAD, _STEP_SIGMA, predicted)
+            # A jump is larger than constant velocity predicts; what is seen of the object says where it is by now.
+            shifted = se3.translation(seen.centroid_m - se3.transform(predicted, view.centroid_m[None])[0]) @ predicted
+            density: AbstractPoseDensity = _near(view, _STEP_SIGMA_RAD, _STEP_SIGMA, [predicted, shifted])
             expected, registrar = rendered, _FOLLOWING
         else:
             expected, registrar = last.pose.mean, self.registrar
@@ -465,11 +467,11 @@ _FOLLOWING = VisibilityRegistrar(search=Search(min_starts=12, max_starts=12, pro
 """Few starts: the pose is predicted."""
 
 
-def _near(view: RayImage, sigma_rad: float, sigma: float, motion: Array | None = None) -> KernelMixture:
-    """Return a proposal about a motion (4, 4), or none, in units of the object's size."""
+def _near(view: RayImage, sigma_rad: float, sigma: float, motions: Sequence[Array] = (np.eye(4),)) -> KernelMixture:
+    """Return a proposal about some motions (4, 4), or none, in units of the object's size."""
     return KernelMixture(
-        (np.eye(4) if motion is None else motion)[None],
-        np.ones(1),
+        np.stack(motions),
+        np.full(len(motions), 1.0 / len(motions)),
         centre_m=view.centroid_m,
         sigma_rad=sigma_rad,
         sigma_m=sigma * view.size_m,
