@@ -334,6 +334,8 @@ def test_a_camera_that_goes_round_is_not_taken_for_noisy_depth(rng, step_deg):
     scene = Segmenter().scene(frames)
     assert scene.camera_moves
     assert not scene.still
+    assert scene.range_noise is not None  # the table shows it in single frames
+    assert 0.5e-3 < scene.range_noise.pixel_sigma_inverse_per_m * 0.9**2 < 2e-3
 
 
 def island(k, rng, *, plate):

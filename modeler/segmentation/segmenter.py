@@ -24,8 +24,8 @@ from modeler.segmentation.depth_images import (
 from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, nearest_seen_m
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
-from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation, checked
-from modeler.views.range_noise import RangeNoise, range_noise
+from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation, checked, spread
+from modeler.views.range_noise import NOISE_FRAMES, RangeNoise, range_noise
 from modeler.views.rays import closed, gap_px, interpolated, measured_share
 
 _CHANGES = 2.0
@@ -82,7 +82,10 @@ class Segmenter:
         if shows_object_alone([_measured(frame) for frame in shown], shown[0].camera, self.noise):
             return Scene(alone=True)
         scene = self._learn(shown)
-        if scene.zone_m is None or not scene.still:
+        if not scene.still:
+            few = spread(shown, NOISE_FRAMES)
+            return replace(scene, range_noise=range_noise([(frame, self.segment(frame, scene).mask) for frame in few]))
+        if scene.zone_m is None:
             return scene
         # A second pass: whole masks determine zone and visible area better than the moving pixels.
         looks, whole = self._looks(shown, scene)
