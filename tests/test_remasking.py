@@ -9,7 +9,7 @@ from segmentation_worlds import OBJECT, World, iou
 
 from modeler import Modeler, se3
 from modeler.evaluation import rotation_error_deg
-from modeler.pipeline.remasking import LEAST_TURN_DEG, moving_along, settled, turned_deg
+from modeler.pipeline.correcting import LEAST_TURN_DEG, moving_along, settled, turned_deg
 from modeler.segmentation import Scene
 from modeler.types import Refining, Searching, Step
 from modeler.views import Sensor

@@ -19,7 +19,7 @@ from modeler.runs.known_objects import known_object
 from modeler.sequences.rendering.recipe import Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.tracking import ModelRenderer, Tracked, Tracker
-from modeler.tracking.errors import of_the_camera, of_the_model
+from modeler.tracking.tracked import of_the_camera, of_the_model
 from modeler.types import Array, Camera, Frame, InputError, ObjectModel, PoseGaussian
 from modeler.views import Sensor
 from modeler.views.rays import part_of, thinned

@@ -39,11 +39,11 @@ from modeler.types import (
     spread,
 )
 
-_ALIGNMENT_SIGMA_RAD = 0.12  # standard deviation of the models' alignment
-_ALIGNMENT_SIGMA = 0.15  # of its shift, in units of the object's size
+ALIGNMENT_SIGMA_RAD = 0.12  # standard deviation of the alignment of a model with another, or with a frame
+ALIGNMENT_SIGMA = 0.15  # of its shift, in units of the object's size
 _OPEN_SHARE = 0.5  # of the first: with more, the images add less than three times the information of the alignment
 _MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment; beyond, it is at another mode
-_MAX_VIEWS: Final = 20  # of a segment, compared with as many of the other
+MAX_VIEWS: Final = 20  # of a segment, compared with as many of the other; of a run, with each of its views
 _COARSE_VOXELS: Final = 64**3  # of models to align
 _MIN_ALIGNMENTS: Final = 4  # about which pairs of views are registered
 _MAX_ALIGNMENTS: Final = 24  # as many ways has a cube to match its shape, of which print tells one
@@ -107,7 +107,7 @@ class Joiner:
     """Returns a view with the images that a likelihood looks up."""
     pairs: int = 6
     """Number of pairs of views to register, one of each segment."""
-    sigma_rad: float = _ALIGNMENT_SIGMA_RAD
+    sigma_rad: float = ALIGNMENT_SIGMA_RAD
     """Standard deviation of the rotation of an alignment about which pairs are registered."""
 
     def join(self, target: Segment, source: Segment) -> list[Alignment]:
@@ -131,7 +131,7 @@ class Joiner:
         is the chance deviation of the misfits of independent measurements, as many as a pair has for each view of the
         smaller segment (method, eq. 11.2).
         """
-        count = min(_MAX_VIEWS, len(target.frames), len(source.frames))
+        count = min(MAX_VIEWS, len(target.frames), len(source.frames))
         freedom = count * self._independent(target, source)
         allowed = 0.5 * (float(chdtri(freedom, _TAIL)) - freedom) / count
         *found, shared = self._across(target, source, [alignment])[..., 0]
@@ -163,7 +163,7 @@ class Joiner:
         scores = self.likelihoods(target, source, alignments)
         agreed = np.array([alignment.accepted >= MIN_JOINS for alignment in alignments])
         ranks = np.where(agreed | ~agreed.any(), scores, -np.inf)
-        shares = np.exp(min(_MAX_VIEWS, len(target.frames), len(source.frames)) * (ranks - ranks.max()))
+        shares = np.exp(min(MAX_VIEWS, len(target.frames), len(source.frames)) * (ranks - ranks.max()))
         shares /= shares.sum()
         order = np.argsort(-ranks, kind="stable")
         return [replace(alignments[k], log_likelihood=float(scores[k]), share=float(shares[k])) for k in order]
@@ -247,14 +247,7 @@ class Joiner:
         for t, s in pairs:
             views = self.ready(source.views[s]), self.ready(target.views[t])
             guess = se3.inverse(target.solution.trajectory[t]) @ target_from_source @ source.solution.trajectory[s]
-            density = KernelMixture(
-                guess[None],
-                np.ones(1),
-                centre_m=views[0].centroid_m,
-                sigma_rad=self.sigma_rad,
-                sigma_m=_ALIGNMENT_SIGMA * views[0].size_m,
-                evidence=False,
-            )
+            density = KernelMixture.about(guess, views[0], self.sigma_rad, ALIGNMENT_SIGMA * views[0].size_m)
             posterior = self.registrations.register(*views, density).without_samples()
             edges.append(self._judged(posterior, views, guess))
         return tuple(edges)
@@ -288,7 +281,7 @@ class Joiner:
 
     def _across(self, target: Segment, source: Segment, alignments: Sequence[Alignment]) -> Array:
         """Return as `_nats` (3, m, n) the m pairs of views, one of each segment, for n alignments."""
-        targets, sources = self._spread(target, _MAX_VIEWS), self._spread(source, _MAX_VIEWS)
+        targets, sources = self._spread(target, MAX_VIEWS), self._spread(source, MAX_VIEWS)
         placed = [_placed(target, source, alignment) for alignment in alignments]
         found = [
             self._nats(other, view, np.stack([se3.inverse(poses[t]) @ poses[s] for poses in placed]))
@@ -301,7 +294,7 @@ class Joiner:
         """Return as `_nats` (3, m) the m pairs of views within segments; one of zeros if there are none."""
         own = [
             self._nats(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[:, 0]
-            for views, poses in ((self._spread(one, _MAX_VIEWS), one.solution.trajectory) for one in segments)
+            for views, poses in ((self._spread(one, MAX_VIEWS), one.solution.trajectory) for one in segments)
             for t, s in itertools.combinations(views, 2)
         ]
         return np.stack(own, axis=1) if own else np.zeros((3, 1))

@@ -12,12 +12,11 @@ from modeler.closure import Placement
 from modeler.fusion import Preview, conditional_covariances, widened
 from modeler.graph import MovingGraph, estimate_focal_length, shared_noise, variance_factor
 from modeler.pipeline.attempts import Stage
-from modeler.pipeline.newest import with_last
-from modeler.pipeline.pairs import Prepared
-from modeler.pipeline.realigning import Realigner, joined
-from modeler.pipeline.remasking import (
+from modeler.pipeline.correcting import (
     LEAST_TURN_DEG,
     MAX_ROUNDS,
+    Realigner,
+    joined,
     masks_of,
     moving_along,
     remasked,
@@ -25,6 +24,8 @@ from modeler.pipeline.remasking import (
     settled,
     turned_deg,
 )
+from modeler.pipeline.newest import with_last
+from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import Placed, State
 from modeler.segmentation import Scene
 from modeler.system.concurrency import prefetching

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import i0e, i1e
 
 from modeler import se3
-from modeler.types import AbstractPoseDensity, Array
+from modeler.types import AbstractPoseDensity, Array, RayImage
 from modeler.types.base import check_covariance
 
 NODES = 4097  # of a tabulated distribution function: a thousand times finer than a standard deviation
@@ -138,6 +138,13 @@ class KernelMixture(AbstractPoseDensity):
     sigma_m: float
     """Standard deviation of the point's position, along each axis."""
     evidence: bool = True
+
+    @classmethod
+    def about(cls, motion: Array, source: RayImage, sigma_rad: float, sigma_m: float) -> KernelMixture:
+        """Return a proposal about one motion (4, 4) of a source view, or about several (n, 4, 4) alike."""
+        means = motion.reshape(-1, 4, 4)
+        weights = np.full(len(means), 1.0 / len(means))
+        return cls(means, weights, source.centroid_m, sigma_rad, sigma_m, evidence=False)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         middles = self.means[rng.choice(len(self.weights), count, p=self.weights)]

@@ -27,7 +27,7 @@ from modeler.types.base import check_parameters
 
 _MIN_SIGMA_RAD, _MIN_SIGMA_M = np.radians(2.0), 0.004  # the search does not need more precision
 _INFLATION = 2.0  # factor on the graph's standard deviations, which do not include systematic errors
-_MAX_STEPS = 3.0  # beyond, constant velocity is no longer plausible
+MAX_STEPS = 3.0  # beyond, constant velocity is no longer plausible
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,8 @@ class PredictedProposal(AbstractPrior):
         sigma_rad, sigma_m = (
             float(np.sqrt(np.linalg.eigvalsh(c)[-1])) for c in (covariance[:3, :3], covariance[3:, 3:])
         )
-        guess = KernelMixture(
-            self.expected.mean[None],
-            np.ones(1),
-            centre_m=source.centroid_m,
-            sigma_rad=max(_INFLATION * sigma_rad, _MIN_SIGMA_RAD),
-            sigma_m=max(_INFLATION * sigma_m, _MIN_SIGMA_M),
-            evidence=False,
-        )
+        sigmas = max(_INFLATION * sigma_rad, _MIN_SIGMA_RAD), max(_INFLATION * sigma_m, _MIN_SIGMA_M)
+        guess = KernelMixture.about(self.expected.mean, source, *sigmas)
         return defensive_mixture(self.known.between(source, target), [guess])
 
     def relaxed(self, steps: float) -> PredictedProposal:
@@ -125,18 +119,12 @@ class VelocityPrior(AbstractProposal):
             return None
         (before, object_from_before), (last, object_from_last) = self.trajectory[-2:]
         pace = (source.index - last) / (last - before)
-        if not 0.0 < pace <= _MAX_STEPS:
+        if not 0.0 < pace <= MAX_STEPS:
             return None
         twist = se3.log(se3.inverse(object_from_before) @ object_from_last)
         predicted = se3.inverse(poses[target.index]) @ object_from_last @ se3.exp(pace * twist)
-        return KernelMixture(
-            predicted[None],
-            np.ones(1),
-            centre_m=source.centroid_m,
-            sigma_rad=float(np.radians(self.velocity_sigma_deg) * max(pace, 1.0)),
-            sigma_m=self.velocity_sigma_m * max(pace, 1.0),
-            evidence=False,
-        )
+        sigmas = float(np.radians(self.velocity_sigma_deg)), self.velocity_sigma_m
+        return KernelMixture.about(predicted, source, *(max(pace, 1.0) * sigma for sigma in sigmas))
 
     def learned(self, solution: Solution, edges: Sequence[Edge]) -> VelocityPrior:
         trajectory = tuple(sorted(solution.trajectory.items(), key=lambda item: item[0]))

@@ -42,13 +42,11 @@ from modeler.views.range_noise import RangeNoise
 _CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
 _IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
 _NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
-_ELSEWHERE = (
-    0.3  # share of the moving pieces' score elsewhere from which the object is ambiguous: 0.4 chooses of two alike
-)
+_ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere that makes it ambiguous: 0.4 chooses of two alike
 RIVAL = 0.4  # ratio of the score of what else may be the object from which the choice is ambiguous
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _TOUCHING_PX = 3
-_ON_PLANE, _ABOVE, _BELOW = 0.1, 0.01, 0.2  # shares of the points: at least, at least, and at most for a support plane
+_ON_PLANE, _BELOW = 0.1, 0.2  # shares of the points: at least, and at most for a support plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,6 +300,6 @@ def _supported(depth_m: Float32Array, camera: Camera, noise: DepthNoise) -> bool
     for plane in planes[upright(planes)]:
         height = heights(seen, plane)
         above, below = np.mean(height > tolerance), np.mean(height < -tolerance)
-        if above > _ABOVE and below < _BELOW and 1.0 - above - below > _ON_PLANE:
+        if above > HARDLY and below < _BELOW and 1.0 - above - below > _ON_PLANE:
             return True
     return False

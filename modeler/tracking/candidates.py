@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from modeler import se3
-from modeler.segmentation import DepthNoise
+from modeler.segmentation import DepthNoise, Segmenter
 from modeler.segmentation.depth_images import mixed_pixels, pieces, planning_stride, point_image, without_specks
 from modeler.segmentation.planes import dominant_planes, heights
 from modeler.tracking.rendering import ModelRenderer
@@ -20,7 +20,6 @@ from modeler.views.rays import part_of
 _SCENERY = 0.7  # squares of the model's width: larger planes are tables and walls; a cube's face is a third of one
 _GRAZING = 0.05  # least cosine of a plane with the line of sight, below which its area is not known
 _LEAST, _MOST = 0.15, 1.3  # extent of a piece, in widths of the model
-_LEAST_PX = 100  # of a piece, as of the segmenter
 _AROUND = 1.1  # radii of the model around the seed of a part of a larger piece
 _REACH = 0.15  # radii of the model by which it may have moved beyond its prediction
 CLOSE: Final = 2.0
@@ -48,13 +47,13 @@ class CandidateFinder:
         labels = pieces(frame.depth_m, off)
         counts = np.bincount(labels.ravel())
         found: list[tuple[bool, float, BoolArray]] = []
-        for label in np.flatnonzero(counts >= _LEAST_PX):
+        for label in np.flatnonzero(counts >= Segmenter.min_points):
             if label == 0:
                 continue
             piece = labels == label
             for part in self._parts(piece, points, renderer):
                 whole = part is piece
-                if np.count_nonzero(part) >= _LEAST_PX:
+                if np.count_nonzero(part) >= Segmenter.min_points:
                     low_m, high_m = np.percentile(points[part], [2.0, 98.0], axis=0)
                     extent = float(np.linalg.norm(high_m - low_m)) / width_m
                     if _LEAST < extent < _MOST:

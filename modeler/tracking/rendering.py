@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.kernels import planes
-from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel, Plane, RayImage
+from modeler.system.pictures import raycaster, tensor
+from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel, Plane, RayImage, area_vectors_m2
 from modeler.views import Sensor
 
 if TYPE_CHECKING:
@@ -66,10 +67,9 @@ class ModelRenderer:
 
         The vector areas of a closed surface sum to 0; what they sum to is the area of the plane hole that is left.
         """
-        corners = self.model.vertices_m[self.model.triangles[self._seen]]
-        areas_m2 = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        hole_m2 = float(np.linalg.norm(areas_m2.sum(axis=0)))
-        return hole_m2 <= _MISSING_SHARE * (hole_m2 + float(np.linalg.norm(areas_m2, axis=1).sum()))
+        vectors_m2 = area_vectors_m2(self.model.vertices_m, self.model.triangles[self._seen])
+        hole_m2 = float(np.linalg.norm(vectors_m2.sum(axis=0)))
+        return hole_m2 <= _MISSING_SHARE * (hole_m2 + float(np.linalg.norm(vectors_m2, axis=1).sum()))
 
     def view(
         self,
@@ -121,10 +121,8 @@ class ModelRenderer:
             camera: of the image.
             stride: of the pixels that are cast, each of which stands for a square of as many.
         """
-        import open3d as o3d
-
         w, h = (axis[::stride, ::stride] for axis in camera.rays())
-        hits = self._scene.cast_rays(o3d.core.Tensor.from_numpy(_rays(camera_from_model, w, h)))
+        hits = self._scene.cast_rays(tensor(_rays(camera_from_model, w, h)))
         depth_m = hits["t_hit"].numpy()
         depth_m = np.repeat(np.repeat(depth_m, stride, axis=0), stride, axis=1)[: camera.height, : camera.width]
         return np.isfinite(depth_m), depth_m.astype(np.float64)
@@ -168,11 +166,9 @@ class ModelRenderer:
         self, camera_from_model: Array, camera: Camera
     ) -> tuple[npt.NDArray[np.float32], BoolArray, BoolArray, _Hits]:
         """Return depth (h, w) in m, where seen surface is, where nothing is known, and where rays meet the surface."""
-        import open3d as o3d
-
         shape, window = (camera.height, camera.width), self._window(camera_from_model, camera)
         rays = _rays(camera_from_model, *(axis[window] for axis in camera.rays()))
-        found = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
+        found = self._scene.cast_rays(tensor(rays))
         near_m = found["t_hit"].numpy()
         met = np.isfinite(near_m)
         rows, columns = np.nonzero(met)
@@ -225,13 +221,7 @@ class ModelRenderer:
 
     @cached_property
     def _scene(self) -> o3d.t.geometry.RaycastingScene:
-        import open3d as o3d
-
-        scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor.from_numpy
-        scene.add_triangles(
-            tensor(self.model.vertices_m.astype(np.float32)), tensor(self.model.triangles.astype(np.uint32))
-        )
-        return scene
+        return raycaster(self.model.vertices_m, self.model.triangles)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,16 @@
-"""What a tracker says of an object in one frame."""
+"""What a tracker says of an object in one frame, and errors of poses that do not average out over points."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
-from modeler.types import Mode, PoseGaussian, RayImage
+from modeler import se3
+from modeler.fusion.symmetries import Symmetries
+from modeler.tracking.rendering import ModelRenderer
+from modeler.types import Array, Mode, PoseGaussian, RayImage
 
 Presence = Literal["found", "followed", "unsure", "not there", "too few points"]
 
@@ -45,3 +48,70 @@ class Tracked:
     """Wall time in s."""
     view: RayImage | None = field(default=None, repr=False)
     """The frame, or the part of it around a followed object, prepared for registration."""
+
+
+PATCHES: Final = 8.0
+"""Number of patches of the surface that a view shows in which errors of a fused model are alike.
+
+Measured: with it, NEES/6 of models built of six rendered shapes of the tuning half is 0.2 to 1.6, its mean 0.9.
+"""
+
+
+def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) -> Array:
+    """Return the covariance (6, 6) of ξ in camera_from_model · Exp(ξ) due to the model's errors.
+
+    Point-to-plane distances have rows a = (p × n, n), with mean B of a aᵀ. If distances err by σ, alike within each of
+    K patches, a solution from surface alone, of covariance C, is moved with the covariance (σ² / K) B⁻¹ = (σ² / K) s C.
+    In the direction in which surface tells most, it tells nearly all: 1 / s is the largest eigenvalue of C B. Places of
+    colours and outlines on the model err as its surface does, so that what they tell counts alike (method, eq. 15.2).
+
+    Args:
+        seen: the object in the frame.
+        pose: camera_from_model, and the covariance C of ξ if the model is exact.
+        renderer: of the model.
+    """
+    if not len(seen.points_m):
+        return np.zeros((6, 6))
+    model_from_camera = se3.inverse(pose.mean)
+    arms = se3.transform(model_from_camera, seen.points_m) - renderer.centre_m
+    normals = seen.normals @ model_from_camera[:3, :3].T
+    rows = np.concatenate([np.cross(arms, normals), normals], axis=1)
+    surface = rows.T @ rows / len(rows)
+    about = se3.covariance_about(pose.covariance, renderer.centre_m)
+    root = np.linalg.cholesky(about)
+    scaled = about / np.linalg.eigvalsh(root.T @ surface @ root)[-1]
+    return se3.covariance_about(renderer.sigma_m**2 / PATCHES * scaled, -renderer.centre_m)
+
+
+def of_the_camera(camera_from_model: Array, centre_m: Array, sigma_focal: float, depth_scale_sigma: float) -> Array:
+    """Return the covariance (6, 6) of ξ due to focal length and depth scale, both common to all points.
+
+    A longer focal length moves the object towards the optical axis, by its distance from it; a scale of depth moves it
+    along its ray (method, eq. 15.3).
+
+    Args:
+        camera_from_model: (4, 4).
+        centre_m: (3,) middle of the model.
+        sigma_focal: standard deviation of the logarithm of the focal length.
+        depth_scale_sigma: that of the depth scale.
+    """
+    place_m = se3.transform(camera_from_model, centre_m[None])[0]
+    covariance = np.zeros((6, 6))
+    for sigma, moved_m in ((sigma_focal, place_m * (-1.0, -1.0, 0.0)), (depth_scale_sigma, place_m)):
+        shift = camera_from_model[:3, :3].T @ moved_m
+        covariance[3:, 3:] += sigma**2 * np.outer(shift, shift)
+    return covariance
+
+
+def free_directions(symmetries: Symmetries, *, coloured: bool) -> Array:
+    """Return the covariance (6, 6) of ξ of the rotations that the model's symmetries leave open.
+
+    Args:
+        symmetries: of the model.
+        coloured: whether colours are seen, which may resolve those of the shape.
+    """
+    found = symmetries.with_colour if coloured and symmetries.with_colour is not None else symmetries
+    covariance = np.zeros((6, 6))
+    for axis in found.continuous:
+        covariance += np.pi**2 / 3.0 * np.outer(axis.turn, axis.turn)
+    return covariance

@@ -12,19 +12,27 @@ import numpy as np
 from modeler import se3
 from modeler.fusion import SymmetryFinder
 from modeler.fusion.symmetries import Symmetries
+from modeler.pipeline.joining import ALIGNMENT_SIGMA, ALIGNMENT_SIGMA_RAD
 from modeler.pipeline.pairs import SEGMENTED
 from modeler.priors.mixtures import KernelMixture
+from modeler.priors.proposals import MAX_STEPS
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.posterior import MIN_MODE_SHARE
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.search import Search
 from modeler.segmentation import Scene, Segmenter
 from modeler.tracking.candidates import CLOSE, CandidateFinder
-from modeler.tracking.errors import free_directions, of_the_camera, of_the_model
-from modeler.tracking.odds import log_odds, relative_weights
 from modeler.tracking.rendering import COARSE_PX, FINE_PX, MOST_PX, ModelRenderer
-from modeler.tracking.search import RIVAL_NATS, Viewpoints, ViewpointSearch
-from modeler.tracking.tracked import USABLE_M, USABLE_RAD, Presence, Tracked
+from modeler.tracking.search import RIVAL_NATS, Viewpoints, ViewpointSearch, log_odds, relative_weights
+from modeler.tracking.tracked import (
+    USABLE_M,
+    USABLE_RAD,
+    Presence,
+    Tracked,
+    free_directions,
+    of_the_camera,
+    of_the_model,
+)
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -47,9 +55,7 @@ from modeler.views.rays import part_of, thinned
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Metres in a unit of length."""
 
-_SIGMA_RAD, _SIGMA = 0.12, 0.15  # of a pose found by the search: rotation, and shift in units of the object's size
 _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames before
-_MOST_STEPS = 3.0  # over which a velocity is extrapolated
 _OVERLAP = 0.6  # least, with any rotation
 _DOUBT = 0.02  # probability of another object or place up to which an answer is sure
 _BEYOND_DOUBT = 30.0  # nats from which no other place is searched: twice what a wrong one reached in 87 scenes
@@ -222,7 +228,9 @@ class Tracker:
             predicted = rendered @ se3.inverse(expected)
             # A jump is larger than constant velocity predicts; what is seen of the object says where it is by now.
             shifted = se3.translation(seen.centroid_m - se3.transform(predicted, view.centroid_m[None])[0]) @ predicted
-            density: AbstractPoseDensity = _near(view, _STEP_SIGMA_RAD, _STEP_SIGMA, [predicted, shifted])
+            density: AbstractPoseDensity = KernelMixture.about(
+                np.stack([predicted, shifted]), view, _STEP_SIGMA_RAD, _STEP_SIGMA * view.size_m
+            )
             expected, registrar = rendered, _FOLLOWING
         else:
             expected, registrar = last.pose.mean, self.registrar
@@ -262,7 +270,7 @@ class Tracker:
             return poses[-1]
         (first, last), before = self.newest, poses[0]
         pace = (frame.time_s - last.time_s) / max(last.time_s - first.time_s, 1e-9)
-        if not 0.0 < pace <= _MOST_STEPS:
+        if not 0.0 < pace <= MAX_STEPS:
             return poses[-1]
         # Motion of the object about its own centre, so that a turn does not swing it about the camera.
         about = se3.translation(self.renderer.centre_m)
@@ -376,7 +384,8 @@ class Tracker:
     def _registered(self, view: RayImage, pose: Array, rng: np.random.Generator) -> Posterior:
         """Return the registration of a frame against the model about a pose (4, 4)."""
         seen = self.renderer.view(pose, view.frame.camera, self.sensor)
-        return self.registrar.register(view, seen, _near(view, _SIGMA_RAD, _SIGMA), rng=rng)
+        near = KernelMixture.about(np.eye(4), view, ALIGNMENT_SIGMA_RAD, ALIGNMENT_SIGMA * view.size_m)
+        return self.registrar.register(view, seen, near, rng=rng)
 
     def _pair(
         self, view: RayImage, camera_from_model: Array, rng: np.random.Generator, most_px: float = MOST_PX
@@ -436,7 +445,7 @@ class Tracker:
         turns, first = [np.eye(4), *found.discrete], modes[0].pose
         for mode in modes[1:]:
             apart = [se3.rotation_angle(se3.inverse(first.mean @ turn) @ mode.pose.mean) for turn in turns]
-            if not found.continuous and min(apart) > _SIGMA_RAD:
+            if not found.continuous and min(apart) > ALIGNMENT_SIGMA_RAD:
                 return "several poses explain the image"
         sigma_rad, sigma_m = self._sigmas(first, found)
         if sigma_rad > USABLE_RAD:
@@ -465,18 +474,6 @@ _SYMMETRIES = SymmetryFinder(points=1000, icp_points=150, directions=0)
 """About the likely axes only."""
 _FOLLOWING = VisibilityRegistrar(search=Search(min_starts=12, max_starts=12, proposals=3))
 """Few starts: the pose is predicted."""
-
-
-def _near(view: RayImage, sigma_rad: float, sigma: float, motions: Sequence[Array] = (np.eye(4),)) -> KernelMixture:
-    """Return a proposal about some motions (4, 4), or none, in units of the object's size."""
-    return KernelMixture(
-        np.stack(motions),
-        np.full(len(motions), 1.0 / len(motions)),
-        centre_m=view.centroid_m,
-        sigma_rad=sigma_rad,
-        sigma_m=sigma * view.size_m,
-        evidence=False,
-    )
 
 
 def _of_model(motion: PoseGaussian, rendered: Array) -> PoseGaussian:

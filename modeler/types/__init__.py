@@ -28,6 +28,8 @@ from modeler.types.model import Searching as Searching
 from modeler.types.model import Shortcoming as Shortcoming
 from modeler.types.model import Step as Step
 from modeler.types.model import Verdict as Verdict
+from modeler.types.model import area_vectors_m2 as area_vectors_m2
+from modeler.types.model import areas_m2 as areas_m2
 from modeler.types.posteriors import Mode as Mode
 from modeler.types.posteriors import PoseGaussian as PoseGaussian
 from modeler.types.posteriors import Posterior as Posterior

@@ -221,3 +221,14 @@ class Fusing:
 
 
 Event = Step | Searching | Refining | Fusing  # an event of a run
+
+
+def area_vectors_m2(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> Array:
+    """Return the normals (t, 3) of triangles (t, 3) of vertices (v, 3), each as long as the area."""
+    one, two, three = np.moveaxis(vertices_m[triangles], 1, 0)
+    return 0.5 * np.cross(two - one, three - one)
+
+
+def areas_m2(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> Array:
+    """Return the areas (t,) of triangles (t, 3) of vertices (v, 3)."""
+    return np.linalg.norm(area_vectors_m2(vertices_m, triangles), axis=1)

@@ -1,0 +1,213 @@
+"""What images contradict, made anew: masks without surface that does not move with the object, and alignments of parts.
+
+A mask may hold an arm that holds the object, and a pair that matches by chance misplaces all frames from it on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+
+from modeler import se3
+from modeler.pipeline.attempts import told_otherwise
+from modeler.pipeline.joining import MAX_VIEWS, MIN_JOINS, Joiner, Segment, rejected_elsewhere
+from modeler.pipeline.pairs import Prepared
+from modeler.pipeline.state import State
+from modeler.pipeline.tracking import Tracker
+from modeler.types import Array, BoolArray, Edge, Outcome, RayImage, Searching, Segmentation, spread
+from modeler.verdict.evidence import (
+    FreeSpace,
+    default_tolerance_m,
+    faces_camera,
+    free_space,
+    looked_up,
+    nearest_around,
+)
+from modeler.views import Sensor
+
+MAX_ROUNDS: Final = 3  # of four drawn captures one was right after the first, one after the second, one settled by then
+"""How often masks are made anew: better masks make better poses, which make better masks."""
+LEAST_TURN_DEG: Final = 45.0  # measured: an arm that was registered 23° and 24°, objects in hands 83° to 177°
+"""Largest rotation between two views from which on what was registered is the object, and not an arm that turns it."""
+_SETTLED: Final = 0.05  # share of the pixels of all masks: rims differ by as much between masks that are both right
+_POINTS: Final = 5000  # of a view that are looked up in others: 1.5 % of its size apart
+_BLUR: Final = 0.04  # of the mask's size, over which looks are pooled; 0.02 and 0.08 give the same masks to 2 %
+
+
+def moving_along(
+    views: Mapping[int, RayImage], others: Mapping[int, RayImage], trajectory: Mapping[int, Array], tolerance_m: float
+) -> dict[int, BoolArray]:
+    """Return the part (h, w) of each view's mask that moves with the object, by frame number.
+
+    A point moves with it if, by the poses, others see surface where it should be more often than nothing: the space is
+    free there, or the camera measured nothing around. Looks are pooled over the image, as free space is found only
+    where something was measured behind; points that no look reaches go with the nearest.
+
+    Args:
+        views: with the masks as found first.
+        others: in which they are looked up, with other masks, which do not matter here.
+        trajectory: object_from_camera (4, 4) by frame number.
+        tolerance_m: error of the surface above which a model is wrong.
+    """
+    chosen = spread([frame for frame in others if frame in trajectory], MAX_VIEWS)
+    reaches_m = {other: nearest_around(others[other], far_gaps=True) for other in chosen}
+    found = {}
+    for frame, view in views.items():
+        if frame not in trajectory:
+            continue
+        some = view.along_curve[:: max(len(view.points_m) // _POINTS, 1)]
+        some = some[faces_camera(view.points_m[some], view.normals[some])]
+        looks = np.zeros((2, *view.frame.depth_m.shape))
+        rows, columns = view.pixels[some].T
+        for other in chosen:
+            if other != frame:
+                motion = se3.inverse(trajectory[other]) @ trajectory[frame]
+                moved_m, turned = se3.transform(motion, view.points_m[some]), view.normals[some] @ motion[:3, :3].T
+                looks[:, rows, columns] += looked_up(others[other], reaches_m[other], moved_m, turned, tolerance_m)
+        found[frame] = _kept(np.asarray(view.frame.mask), looks)
+    return found
+
+
+def _kept(mask: BoolArray, looks: Array) -> BoolArray:
+    """Return the part (h, w) of a mask that moves with the object.
+
+    Args:
+        mask: (h, w).
+        looks: (2, h, w) number of views with nothing, and with surface, where the point at a pixel should be.
+    """
+    away, there = ndimage.gaussian_filter(looks, (0.0, *[_BLUR * np.sqrt(np.count_nonzero(mask))] * 2))
+    known = mask & (away + there > 0.0)
+    if not known.any():
+        return mask
+    row, column = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
+    moving = np.asarray(away <= there)
+    return np.asarray(mask & moving[row, column], dtype=np.bool_)
+
+
+def turned_deg(trajectory: Mapping[int, Array]) -> float:
+    """Return the largest rotation in degrees between two views, given object_from_camera (4, 4) by frame number."""
+    poses = np.stack([*trajectory.values()])
+    return max(float(np.degrees(se3.rotation_angle(se3.inverse(pose) @ poses).max())) for pose in poses)
+
+
+def settled(masks: Mapping[int, BoolArray], before: Mapping[int, BoolArray]) -> bool:
+    """Return whether masks are those before, but for their rims."""
+    both = [(mask, before[frame]) for frame, mask in masks.items() if frame in before]
+    different = sum(np.count_nonzero(mask ^ other) for mask, other in both)
+    return bool(different <= _SETTLED * sum(np.count_nonzero(mask | other) for mask, other in both))
+
+
+def masks_of(views: Mapping[int, RayImage]) -> dict[int, BoolArray]:
+    """Return the masks (h, w) of views by frame number."""
+    return {frame: np.asarray(view.frame.mask) for frame, view in views.items()}
+
+
+def segmented(view: RayImage, mask: str) -> Prepared:
+    """Return a frame as it was segmented.
+
+    Args:
+        view: with its mask.
+        mask: label of the segmentation's outcome.
+    """
+    found = Segmentation(np.asarray(view.frame.mask), view.plane, Outcome(mask))
+    return Prepared(replace(view.frame, mask=None), found, view)
+
+
+def remasked(prepared: Prepared, mask: BoolArray, sensor: Sensor) -> Prepared:
+    """Return a frame with another mask (h, w)."""
+    found = replace(prepared.segmentation, mask=mask)
+    view = sensor.ray_image(replace(prepared.frame, mask=mask), found.plane)
+    return Prepared(prepared.frame, found, view if len(view.points_m) else None)
+
+
+@dataclass(frozen=True)
+class Realigner:
+    """Aligns two parts of a run anew while surface of one violates the other's free space (docs/method/segments.md).
+
+    A pair that matches by chance, as similar sides of an object do, misplaces all frames from it on. Alignments of both
+    parts are judged by all their views.
+    """
+
+    tracker: Callable[[State], Tracker]
+    """Returns the tracker of a state."""
+    joiner: Callable[[Tracker], Joiner]
+    """Returns the joiner of segments."""
+    tolerance_m: float | None = None
+    """Error of the surface above which a model is called wrong; None: `default_tolerance_m`."""
+
+    def realigned(self, state: State) -> Generator[Searching, None, State]:
+        """Return a state whose views violate each other's free space less, or the same one."""
+        tried: set[tuple[int, int]] = set()
+        while (free := self.free_space(state)) is not None and not free.holds:
+            gap = self._most_contradicted(state, free)
+            if gap is None or gap in tried:
+                break
+            tried.add(gap)
+            other = yield from self._aligned_across(state, *gap)
+            found = None if other is None else self.free_space(other)
+            if other is None or found is None or found.excess >= free.excess:
+                break
+            state = other
+        return state
+
+    def free_space(self, state: State, among: Iterable[int] | None = None) -> FreeSpace | None:
+        """Return the free-space violations between views of a state, by default all, as the verdict judges them."""
+        views = {frame: state.views[frame] for frame in (state.views if among is None else among)}
+        return free_space(views, state.solution.trajectory, self.tolerance(state))
+
+    def tolerance(self, state: State) -> float:
+        """Return the error in m of the surface above which a model is called wrong."""
+        return self.tolerance_m or default_tolerance_m([*state.views.values()], state.solution.variance_factor)
+
+    def _aligned_across(self, state: State, before: int, after: int) -> Generator[Searching, None, State | None]:
+        """Return a state with another alignment of the frames from one on with those before; None without one.
+
+        Args:
+            state: with all edges.
+            before: number of a frame.
+            after: number of the next one, the first of those to align.
+        """
+        state = state.with_spans()
+        early = {frame for frame in state.views if state.places[frame] <= state.places[before]}
+        target, source = state.parted(early), state.parted({*state.views} - early)
+        if target is None or source is None:
+            return None
+        yield Searching(after)
+        tracker = self.tracker(state)
+        merged, _ = joined(self.joiner(tracker), target, source)
+        if merged is None:
+            return None
+        views, motion = state.views, merged.solution.relative(before, after)
+        steps = state.steps(after, before)
+        if told_otherwise(tracker.learned_prior, views[after], views[before], steps, motion[None]):
+            return None
+        kept = {*target.graph.edges, *source.graph.edges}
+        others = [edge for edge in state.graph.edges if edge not in kept]
+        rejected = [rejected_elsewhere(edge, merged.solution) if edge.accepted else edge for edge in others]
+        return merged.refined(rejected).with_spans()
+
+    def _most_contradicted(self, state: State, free: FreeSpace) -> tuple[int, int] | None:
+        """Return the two successive views across which most surface violates free space, if any does."""
+        places, gap = state.places, free.most_contradicted(state.places)
+        while gap is not None:  # of long runs, some views are compared
+            between = [view for view in state.views if places[gap[0]] <= places[view] <= places[gap[1]]]
+            if len(between) == 2:
+                return gap
+            found = self.free_space(state, between)
+            gap = None if found is None else found.most_contradicted(places)
+        return None
+
+
+def joined(joiner: Joiner, target: State, source: State) -> tuple[State | None, Sequence[Edge]]:
+    """Return two states joined by their likeliest alignment, None if too few pairs agree on it, and its edges."""
+    parts = [Segment(state.views, state.solution, state.graph.edges) for state in (target, source)]
+    alignments = joiner.join(parts[0], parts[1])
+    joins = alignments[0].edges if alignments else ()
+    if sum(edge.accepted for edge in joins) < MIN_JOINS:
+        return None, joins
+    merged = target.merged(source, joins)
+    return merged if sum(merged.solution.takes_part(edge) for edge in joins) >= MIN_JOINS else None, joins
