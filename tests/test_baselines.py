@@ -265,7 +265,7 @@ def test_coloured_icp_stops_where_open3d_would() -> None:
         clouds[1],
         reach_m,
         np.eye(4),
-        library.TransformationEstimationForColoredICP(lambda_geometric=method.geometry),
+        library.TransformationEstimationForColoredICP(),
         library.ICPConvergenceCriteria(1e-9, 1e-9, 60),
     )
     ours = method.level(*thin, np.eye(4), voxel_m)
@@ -279,13 +279,13 @@ def test_intensity_gradients_are_those_of_the_print(rng: np.random.Generator) ->
     normal = np.array([0.6, 0.0, -0.8])
     along = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0]])
     cloud = Cloud(across @ along, np.tile(normal, (3000, 1)), 0.5 + across @ [3.0, -2.0])
-    gradients = intensity_gradients(cloud, KDTree(cloud.points_m), 0.01, 30)
+    gradients = intensity_gradients(cloud, KDTree(cloud.points_m), 0.01)
     np.testing.assert_allclose(gradients, np.tile(np.array([3.0, -2.0]) @ along, (3000, 1)), atol=1e-6)
 
 
 def test_a_lonely_point_has_no_intensity_gradient() -> None:
     cloud = Cloud(np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]]), np.tile([0.0, 0.0, -1.0], (2, 1)), np.array([0.1, 0.9]))
-    np.testing.assert_array_equal(intensity_gradients(cloud, KDTree(cloud.points_m), 0.1, 30), 0.0)
+    np.testing.assert_array_equal(intensity_gradients(cloud, KDTree(cloud.points_m), 0.1), 0.0)
 
 
 def test_gicp_states_its_hessian_in_our_tangent(pair: Pair, rng: np.random.Generator) -> None:
@@ -295,7 +295,7 @@ def test_gicp_states_its_hessian_in_our_tangent(pair: Pair, rng: np.random.Gener
     points, shapes = [], []
     voxel_m = max(Cloud.of(view).size_m for view in pair) / 20
     for view in pair:
-        cloud, _ = small_gicp.preprocess_points(view.points_m - view.centroid_m, voxel_m, method.neighbours)
+        cloud, _ = small_gicp.preprocess_points(view.points_m - view.centroid_m, voxel_m, 10)
         points.append(cloud.points()[:, :3] + view.centroid_m)
         shapes.append(np.array([cloud.cov(k)[:3, :3] for k in range(cloud.size())]))
     pose = found.pose.mean

@@ -7,7 +7,7 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from modeler.registration.features import FeatureMatcher, fpfh, kabsch, mutual_m
 from modeler.system.processes import install_command
 from modeler.types import Array, InputError, RayImage
 
-_SAMPLE_SIZE = 3  # correspondences that determine a motion
+_VOXEL = 1 / 40  # edge, as a fraction of the object's size
 _BATCH = 2_000  # draws between evaluations of the stopping rule
 
 
@@ -43,20 +43,10 @@ class FpfhRegistrar(AbstractCloudRegistrar):
     the surfaces leave open.
     """
 
-    voxel: float = 1 / 40
-    """Voxel edge, as a fraction of the object's size."""
-    feature_radius: float = FeatureMatcher.feature_radius
-    """Radius of a feature's neighbourhood, in voxels."""
     reach: float = 1.5
     """Largest distance of correspondences, in voxels."""
-    edge_ratio: float = 0.9
-    """Least ratio of corresponding edges of a drawn triangle."""
     draws: int = 100_000
     """Largest number of triangles drawn."""
-    confidence: float = 0.999
-    """Probability of having found the best motion at which draws end."""
-    scored_points: int = 400
-    """Number of random points of the source by which motions are compared."""
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
         """Return the motion with most inliers among the feature matches."""
@@ -73,15 +63,15 @@ class FpfhRegistrar(AbstractCloudRegistrar):
         """
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return None
-        (voxel_m,) = cube_edges_m(source, target, (self.voxel,))
+        (voxel_m,) = cube_edges_m(source, target, (_VOXEL,))
         source, target = source.thinned(voxel_m), target.thinned(voxel_m)
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return None
-        radius_m, reach_m = self.feature_radius * voxel_m, self.reach * voxel_m
+        radius_m, reach_m = FeatureMatcher.feature_radius * voxel_m, self.reach * voxel_m
         first, second = (fpfh(cloud.points_m, cloud.normals, radius_m) for cloud in (source, target))
         pairs = mutual_matches(first, second)
         tree = KDTree(target.points_m)
-        scored = source.points_m[rng.permutation(len(source.points_m))[: self.scored_points]]
+        scored = source.points_m[rng.permutation(len(source.points_m))[:400]]  # by which motions are compared
         pose = self._ransac(
             source.points_m[pairs[:, 0]], target.points_m[pairs[:, 1]], _Score(scored, tree, reach_m), rng
         )
@@ -94,9 +84,9 @@ class FpfhRegistrar(AbstractCloudRegistrar):
     def _ransac(self, source_m: Array, target_m: Array, score: _Score, rng: np.random.Generator) -> Array | None:
         best, best_score, drawn, needed = None, -np.inf, 0, np.inf
         while drawn < min(needed, self.draws):
-            triples = rng.integers(len(source_m), size=(min(_BATCH, self.draws - drawn), _SAMPLE_SIZE))
+            triples = rng.integers(len(source_m), size=(min(_BATCH, self.draws - drawn), 3))
             drawn += len(triples)
-            triples = triples[self._similar(source_m[triples], target_m[triples])]
+            triples = triples[_similar(source_m[triples], target_m[triples])]
             poses = kabsch(source_m[triples], target_m[triples])
             gaps_m = np.linalg.norm(_transformed(poses, source_m[triples]) - target_m[triples], axis=2)
             poses = poses[np.all(gaps_m < score.reach_m, axis=1)]
@@ -104,14 +94,15 @@ class FpfhRegistrar(AbstractCloudRegistrar):
             if np.max(scores, initial=-np.inf) > best_score:
                 best, best_score = poses[np.argmax(scores)], np.max(scores)
                 agree = np.linalg.norm(se3.transform(best, source_m) - target_m, axis=1) < score.reach_m
-                needed = _draws_needed(float(np.mean(agree)), self.confidence)
+                needed = _draws_needed(float(np.mean(agree)))
         return best
 
-    def _similar(self, source_m: Array, target_m: Array) -> npt.NDArray[np.bool_]:
-        """Return whether triangles (n, 3, 3) have nearly equal edges and no point twice, (n,)."""
-        source_edges, target_edges = (np.linalg.norm(t - np.roll(t, 1, axis=1), axis=2) for t in (source_m, target_m))
-        shorter, longer = np.minimum(source_edges, target_edges), np.maximum(source_edges, target_edges)
-        return np.all((shorter > self.edge_ratio * longer) & (shorter > 0.0), axis=1)
+
+def _similar(source_m: Array, target_m: Array) -> npt.NDArray[np.bool_]:
+    """Return whether triangles (n, 3, 3) have nearly equal edges and no point twice, (n,)."""
+    source_edges, target_edges = (np.linalg.norm(t - np.roll(t, 1, axis=1), axis=2) for t in (source_m, target_m))
+    shorter, longer = np.minimum(source_edges, target_edges), np.maximum(source_edges, target_edges)
+    return np.all((shorter > 0.9 * longer) & (shorter > 0.0), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,26 +124,25 @@ def _transformed(poses: Array, points_m: Array) -> Array:
     return points_m @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
 
 
-def _draws_needed(agreement: float, confidence: float) -> float:
-    """Return the number of draws that contain, with this confidence, one of inliers only."""
-    chance = agreement**_SAMPLE_SIZE
-    return 0.0 if chance >= 1.0 else float(np.log1p(-confidence) / np.log1p(-chance)) if chance > 0.0 else np.inf
+def _draws_needed(agreement: float) -> float:
+    """Return the number of triangles drawn of which, with a probability of 99.9 %, one is of inliers only."""
+    chance = agreement**3
+    return 0.0 if chance >= 1.0 else float(np.log(0.001) / np.log1p(-chance)) if chance > 0.0 else np.inf
+
+
+_REFINEMENT = IcpRegistrar(voxels=FINE)
+"""Without coarse levels, which could leave the basin of a good initial pose."""
 
 
 @dataclass(frozen=True)
 class FpfhIcpRegistrar(AbstractCloudRegistrar):
     """FPFH with RANSAC, refined by point-to-plane ICP."""
 
-    fpfh: FpfhRegistrar = field(default_factory=FpfhRegistrar)
-    """The global search."""
-    icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=FINE))
-    """The refinement, without coarse levels, which could leave the basin of a good initial pose."""
-
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
         """Return the local optimum from the motion of the feature matches."""
         clouds = Cloud.of(source), Cloud.of(target)
-        coarse = self.fpfh.search(*clouds, initial, rng)
-        return None if coarse is None else self.icp.refine(*clouds, coarse.target_from_source)
+        coarse = FpfhRegistrar().search(*clouds, initial, rng)
+        return None if coarse is None else _REFINEMENT.refine(*clouds, coarse.target_from_source)
 
 
 KISS_MISSING = f"KISS-Matcher is not installed; install it with: {install_command('peers')}"
@@ -172,11 +162,6 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
     surfaces leave open.
     """
 
-    voxel: float = 1 / 40
-    """Voxel edge, as a fraction of the object's size."""
-    icp: IcpRegistrar = field(default_factory=lambda: IcpRegistrar(voxels=FINE))
-    """The refinement, without coarse levels, which could leave the basin of a good initial pose."""
-
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
         """Return the local optimum from KISS-Matcher's motion.
 
@@ -188,12 +173,12 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
         clouds = Cloud.of(source), Cloud.of(target)
         if min(len(cloud.points_m) for cloud in clouds) < self.min_points:
             return None
-        return self.icp.refine(*clouds, self.search(*clouds, initial))
+        return _REFINEMENT.refine(*clouds, self.search(*clouds, initial))
 
     def search(self, source: Cloud, target: Cloud, fallback: Array) -> Array:
         """Return the motion (4, 4) that KISS-Matcher finds; `fallback` (4, 4) if it finds none."""
         matcher: Any = importlib.import_module("kiss_matcher")  # its types are known only if it is installed
-        (unit_m,) = cube_edges_m(source, target, (self.voxel,))  # it rejects voxels below 5 mm
+        (unit_m,) = cube_edges_m(source, target, (_VOXEL,))  # it rejects voxels below 5 mm
         centres_m = source.points_m.mean(axis=0), target.points_m.mean(axis=0)
         centred = [
             list(((cloud.points_m - centre_m) / unit_m).astype(np.float32))

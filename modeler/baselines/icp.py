@@ -147,9 +147,6 @@ class GicpRegistrar(AbstractMultiscaleRegistrar):
     over threads are not reproducible.
     """
 
-    neighbours: int = 10
-    """Number of points from which the covariance of a neighbourhood is estimated."""
-
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
         import small_gicp  # slow to load, and only needed here
 
@@ -163,7 +160,7 @@ class GicpRegistrar(AbstractMultiscaleRegistrar):
         jacobian, fitness = None, 0.0
         for voxel_m in cube_edges_m(Cloud.of(source), Cloud.of(target), self.voxels):
             (thin_source, _), (thin_target, tree) = (
-                small_gicp.preprocess_points(points, voxel_m, self.neighbours) for points in centred
+                small_gicp.preprocess_points(points, voxel_m, 10) for points in centred
             )
             if min(thin_source.size(), thin_target.size()) < self.min_points:
                 continue
@@ -189,9 +186,6 @@ class GicpRegistrar(AbstractMultiscaleRegistrar):
         return Fit(target_from_centred @ pose @ centred_from_source, jacobian, fitness)
 
 
-_MIN_NEIGHBOURS = 4  # points, itself included, that determine the gradient of intensity at a point
-
-
 @dataclass(frozen=True)
 class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
     """Multi-scale ICP on distances to planes and differences of intensity (Park, Zhou and Koltun 2017).
@@ -200,11 +194,6 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
     threads finish, so that results are not reproducible to the bit.
     """
 
-    geometry: float = 0.968
-    """Weight (0..1) of squared distances in m; squared differences of intensity have the rest."""
-    neighbours: int = 30
-    """Largest number of points, itself included, for the gradient of intensity, within twice the reach."""
-
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
         clouds = Cloud.coloured(source), Cloud.coloured(target)
         return by_levels(clouds, initial, voxels=self.voxels, min_points=self.min_points, level=self.level)
@@ -212,7 +201,7 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
     def level(self, source: Cloud, target: Cloud, pose: Array, voxel_m: float) -> Fit:
         """Return the local optimum from a pose (4, 4), for downsampled clouds with intensity."""
         tree, reach_m = KDTree(target.points_m), self.reach * voxel_m
-        gradients = intensity_gradients(target, tree, 2.0 * reach_m, self.neighbours)
+        gradients = intensity_gradients(target, tree, 2.0 * reach_m)
         assert source.intensity is not None
         assert target.intensity is not None
         source_intensity, target_intensity = source.intensity, target.intensity
@@ -227,7 +216,7 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
                 Matches(matches.points_m, Cloud(partners.points_m, gradients[partner]), matches.fitness), pose
             )
             differences = source_intensity[near] - target_intensity[partner] - predicted
-            shares = np.sqrt([self.geometry, 1.0 - self.geometry])
+            shares = np.sqrt([0.968, 1.0 - 0.968])  # of squared distances in m and squared differences of intensity
             residuals = np.concatenate([shares[0] * gaps_m, shares[1] * differences])
             jacobian = np.concatenate([shares[0] * by_gap, -shares[1] * by_intensity])
             return Linearised(residuals, np.ones(len(residuals)), jacobian, matches.fitness)
@@ -235,10 +224,13 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
         return descended(source, pose, self.iterations, linearised)
 
 
-def intensity_gradients(cloud: Cloud, tree: KDTree, radius_m: float, neighbours: int) -> Array:
-    """Return the gradients (n, 3) of intensity per m along the surface, by least squares in the tangent planes."""
+def intensity_gradients(cloud: Cloud, tree: KDTree, radius_m: float) -> Array:
+    """Return the gradients (n, 3) of intensity per m along the surface, by least squares in the tangent planes.
+
+    Each is that of the 30 nearest points at most, itself included, within a radius, and 0 of fewer than four.
+    """
     assert cloud.intensity is not None
-    distances, indices = tree.query(cloud.points_m, k=neighbours, distance_upper_bound=radius_m)
+    distances, indices = tree.query(cloud.points_m, k=30, distance_upper_bound=radius_m)
     known = np.isfinite(distances)
     indices = np.where(known, indices, 0)
     arms = cloud.points_m[indices] - cloud.points_m[:, None]
@@ -251,4 +243,4 @@ def intensity_gradients(cloud: Cloud, tree: KDTree, radius_m: float, neighbours:
     slopes = np.linalg.solve(
         spread + mean * (upright + DAMPING * np.eye(3)), np.einsum("nki,nk->ni", arms, rises)[..., None]
     )
-    return np.where(known.sum(axis=1, keepdims=True) >= _MIN_NEIGHBOURS, slopes[..., 0], 0.0)
+    return np.where(known.sum(axis=1, keepdims=True) >= 4, slopes[..., 0], 0.0)

@@ -32,6 +32,7 @@ from modeler.types import (
 )
 
 _SAMPLES, _UNIFORM_SAMPLES = 200_000, 2_000_000  # from a prior, and from everywhere
+_BATCH = 50_000  # samples drawn at a time
 _PILOT = 4096  # poses by which the checks are ordered
 _ANGLE_LIMIT_RAD = 2.0  # up to which rejection sampling of the rotation mostly succeeds
 _WIDENING = 1.5  # largest spread of a point's rays for the test, relative to that of the nearest point seen
@@ -48,16 +49,12 @@ class PaperRegistrar(AbstractRegistrar):
 
     samples: int | None = None
     """Number of samples of the prior; None = 2·10⁶ of a uniform prior, 2·10⁵ of others, which take longer."""
-    batch: int = 50_000
-    """Number of samples drawn at a time."""
     points: int = 60
     """Number of surface points of each view."""
     reach_sigmas: float = 4.0
     """Lateral standard deviations beyond which pixels are ignored; at 4, their part of the sum is e⁻⁸."""
     reject_below: float = 1e-6
     """A sample is rejected if a point's density is below this fraction of that of a hidden point."""
-    min_effective: float = 10.0
-    """Effective sample size below which the outcome is DEGENERATE."""
     device: gpu.Device = "auto"
     """Device that draws, tests and weights samples."""
 
@@ -85,7 +82,7 @@ class PaperRegistrar(AbstractRegistrar):
             source=source.index,
             target=target.index,
             pose=pose,
-            outcome=Outcome.CONVERGED if effective >= self.min_effective else Outcome.DEGENERATE,
+            outcome=Outcome.CONVERGED if effective >= 10.0 else Outcome.DEGENERATE,
             overlap=VisibilityLikelihood().between(source, target, rng).overlap(pose.mean),
             samples=poses,
             weights=weights / weights.sum(),
@@ -141,8 +138,8 @@ class PaperRegistrar(AbstractRegistrar):
         self, density: AbstractPoseDensity | NumberedDraws, samples: int, rng: np.random.Generator
     ) -> Iterator[Array]:
         """Yield samples (n, 12), batch by batch."""
-        for first in range(0, samples, self.batch):
-            count = min(self.batch, samples - first)
+        for first in range(0, samples, _BATCH):
+            count = min(_BATCH, samples - first)
             numbered = isinstance(density, NumberedDraws)
             yield density.poses(first, count) if numbered else rows(density.sample(count, rng))
 

@@ -42,9 +42,6 @@ class Closer:
 
     max_angle_deg: float = NEAR_DEG
     """Largest predicted rotation in degrees to an earlier view."""
-    max_return_deg: float = LARGE_DEG
-    """The same between the last frame and the first if no loop is closed yet: the largest rotation across which views
-    are registered (`priors.general.relaxed_rotation_deg`). A turn of few large steps ends one step before its start."""
     away_deg: float = AWAY_DEG
     """Rotation in degrees by which the object must have turned away from an earlier view for an edge to it to be a
     closure."""
@@ -103,7 +100,8 @@ class Closer:
         """Return whether the object came back to the first view, within reach, at a predicted rotation `angle_deg`."""
         known = gain.map_view
         closed = loops_closed([edge for edge in known.edges if known.solution.takes_part(edge)])
-        reach_deg = self.max_angle_deg if closed else max(self.max_angle_deg, self.max_return_deg)
+        # A turn of few large steps ends one step before its start.
+        reach_deg = self.max_angle_deg if closed else max(self.max_angle_deg, LARGE_DEG)
         probability = replace(gain, max_angle_deg=reach_deg).probability_within([first], np.array([angle_deg]))
         within = bool(probability[0] >= _MIN_PROBABILITY)
         return within and known.came_back(first, last, gain.paths, away_deg=self.away_deg)
