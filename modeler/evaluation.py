@@ -16,7 +16,7 @@ from scipy.special import gammaincinv
 
 from modeler import se3
 from modeler.system.pictures import raycaster, tensor
-from modeler.types import Array, BoolArray, Frame, PoseGaussian
+from modeler.types import Array, BoolArray, Frame, PoseGaussian, areas_m2
 
 LEVELS = (0.5, 0.9, 0.95)  # nominal probabilities of the regions whose coverage is reported
 
@@ -268,7 +268,7 @@ def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: i
         rng: source of randomness.
     """
     a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = areas_m2(vertices_m, triangles)
     if not area.sum() > 0.0:
         raise ValueError("a mesh without area has no surface to sample")
     chosen = rng.choice(len(triangles), size=count, p=area / area.sum())

@@ -17,7 +17,7 @@ from modeler.export.files import mesh_ply, write_atomically
 from modeler.export.placing import CAMERA_AXES
 from modeler.system.pictures import encoded, linear_light, raycaster, tensor
 from modeler.system.processes import check_installed
-from modeler.types import Array, BoolArray, InputError, ObjectModel
+from modeler.types import Array, BoolArray, InputError, ObjectModel, area_vectors_m2, areas_m2
 
 FORMATS = (".ply", ".obj", ".glb", ".stl", ".3mf")
 TEXTURED = (".obj", ".glb")
@@ -211,7 +211,7 @@ def _3mf(model: ObjectModel, unit: Literal["m", "mm"]) -> bytes:
 def _stl(model: ObjectModel, unit: str) -> bytes:
     """Return a binary STL file."""
     corners = model.vertices_m[model.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_vectors_m2(model.vertices_m, model.triangles)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     faces = np.zeros(len(corners), dtype=[("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("spare", "<u2")])
     faces["normal"], faces["corners"] = normals, corners
@@ -276,9 +276,8 @@ def _largest_error(model: ObjectModel) -> float:
     sigmas_m = sigmas_m[np.isfinite(sigmas_m)]
     if not len(sigmas_m) or not len(model.triangles):
         return 0.0
-    corners = model.vertices_m[model.triangles]
-    areas_m2 = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return 3.0 * _MERGED * float(areas_m2.mean()) * (_SHARE * float(np.median(sigmas_m))) ** 2
+    area_m2 = float(areas_m2(model.vertices_m, model.triangles).mean())
+    return 3.0 * _MERGED * area_m2 * (_SHARE * float(np.median(sigmas_m))) ** 2
 
 
 def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
@@ -319,7 +318,6 @@ def _scale_rgb(shares: Array) -> Array:
 
 PADDING_PX = 4  # charts keep this distance, so that colours do not bleed when the image is shrunk
 TRIANGLES = 8_000  # of a mesh whose detail is in the image, at most
-_FILLED = 0.6  # share of the image that charts fill
 PIECE = 1_000  # triangles that are unwrapped at once: the time grows with more than the square of their number
 
 Paint = Callable[[Array, Array, npt.NDArray[np.uint8]], tuple[npt.NDArray[np.uint8], BoolArray]]
@@ -345,16 +343,13 @@ def textured(model: ObjectModel, paint: Paint, side_px: int) -> tuple[ObjectMode
     """Return the model with vertices doubled along seams, and its texture."""
     import xatlas
 
-    corners = model.vertices_m[model.triangles]
-    area_m2 = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    texel_m = (
-        float(np.sqrt(area_m2 / _FILLED)) / side_px
-    )  # approximately: packing determines how much room the charts leave
+    # Approximately: packing determines how much of the image charts fill, some 60 %.
+    texel_m = float(np.sqrt(areas_m2(model.vertices_m, model.triangles).sum() / 0.6)) / side_px
     atlas = xatlas.Atlas()
     # In texels and from the origin: the library compares lengths with constants.
     texels = ((model.vertices_m - model.vertices_m.mean(axis=0)) / texel_m).astype(np.float32)
     used = []
-    for piece in _pieces(corners.mean(axis=1), PIECE):
+    for piece in _pieces(model.vertices_m[model.triangles].mean(axis=1), PIECE):
         vertices, triangles = np.unique(model.triangles[piece], return_inverse=True)
         atlas.add_mesh(texels[vertices], triangles.reshape(-1, 3).astype(np.uint32))
         used.append(vertices)

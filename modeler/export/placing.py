@@ -13,7 +13,7 @@ import numpy as np
 from modeler import se3
 from modeler.export.files import write_atomically
 from modeler.export.reading import poses_of
-from modeler.types import Array, ObjectModel, RayImage
+from modeler.types import Array, ObjectModel, RayImage, areas_m2
 
 Origin = Literal["camera", "base", "centre", "bbox"]
 Up = Literal["z", "y"]
@@ -154,9 +154,8 @@ def _box_centre(points: Array) -> Array:
 
 def _centroid(model: ObjectModel) -> Array:
     """Return the centroid (3,) of the surface of a mesh."""
-    corners = model.vertices_m[model.triangles]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.average(corners.mean(axis=1), axis=0, weights=areas)
+    middles_m = model.vertices_m[model.triangles].mean(axis=1)
+    return np.average(middles_m, axis=0, weights=areas_m2(model.vertices_m, model.triangles))
 
 
 _LEAST_BACK = 0.3  # least horizontal part of the direction to the camera: else it looks straight down

@@ -16,14 +16,13 @@ import numpy.typing as npt
 from modeler.export.files import write_atomically
 from modeler.export.mesh import simplified
 from modeler.system.processes import install_command
-from modeler.types import Array, InputError, ObjectModel
+from modeler.types import Array, InputError, ObjectModel, area_vectors_m2, areas_m2
 
 HULL_TRIANGLES = 500  # most triangles of a convex part; a ball then loses 3 % of its volume
 # For CoACD: of a bear of 0.13 m, 1500 triangles became 15 parts with 5 % more volume in 9 s on two busy cores; with its
 # own settings and 8000 triangles, 70 parts in five minutes.
 PART_TRIANGLES = 1_500  # triangles of the mesh from which convex parts are found
-_CONCAVITY = 0.08  # the threshold of CoACD: how concave a part may stay
-_SEARCH: Mapping[str, Any] = {"resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
+_SEARCH: Mapping[str, Any] = {"threshold": 0.08, "resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
 _LEAST_AREA_M2 = 1e-12  # of a triangle: (1 µm)², below the resolution of a 32-bit file at a distance of 10 m
 
 
@@ -91,9 +90,8 @@ def convex_parts(model: ObjectModel) -> ConvexParts:
 
     coacd.set_log_level("error")
     coarse = simplified(model, PART_TRIANGLES)
-    found = coacd.run_coacd(
-        coacd.Mesh(coarse.vertices_m, coarse.triangles.astype(np.int32)), threshold=_CONCAVITY, seed=0, **_SEARCH
-    )
+    mesh = coacd.Mesh(coarse.vertices_m, coarse.triangles.astype(np.int32))
+    found = coacd.run_coacd(mesh, seed=0, **_SEARCH)
     parts = tuple(_hull(np.asarray(vertices, dtype=np.float64)) for vertices, _ in found)
     return ConvexParts(parts, f"{len(parts)} convex part{'s' if len(parts) != 1 else ''} by CoACD")
 
@@ -115,14 +113,8 @@ def _hull(points_m: Array) -> tuple[Array, npt.NDArray[np.int64]]:
 
 def without_degenerate(model: ObjectModel) -> ObjectModel:
     """Return the model without triangles that have no area."""
-    kept = triangle_areas(model.vertices_m, model.triangles) > _LEAST_AREA_M2
+    kept = areas_m2(model.vertices_m, model.triangles) > _LEAST_AREA_M2
     return model if kept.all() else replace(model, triangles=model.triangles[kept])
-
-
-def triangle_areas(vertices: Array, triangles: npt.NDArray[np.int64]) -> Array:
-    """Return the areas (t,) of triangles (t, 3)."""
-    corners = vertices[triangles]
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
 def with_flat_bottom(model: ObjectModel, laid_m: float | None) -> ObjectModel:
@@ -148,14 +140,12 @@ def with_flat_bottom(model: ObjectModel, laid_m: float | None) -> ObjectModel:
 def bottom_area_m2(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> float:
     """Return the area of the triangles that lie in the plane z = 0 and face down."""
     flat = triangles[np.all(np.abs(vertices_m[triangles][:, :, 2]) < 1e-7, axis=1)]
-    a, b, c = np.moveaxis(vertices_m[flat], 1, 0)
-    return max(0.0, float(-0.5 * np.cross(b - a, c - a)[:, 2].sum()))
+    return max(0.0, -float(area_vectors_m2(vertices_m, flat)[:, 2].sum()))
 
 
 FRICTION: Final = (0.8, 0.005, 0.0001)
 """Sliding, torsional (m) and rolling (m): of wood or cardboard on a table; MuJoCo's defaults but for the first."""
 MOST_TRIANGLES: Final = 200_000  # MuJoCo refuses meshes with more
-_DROP_M = 1e-3  # height above the ground at which the object starts in the scene
 
 
 @dataclass(frozen=True)
@@ -373,9 +363,6 @@ class Settled:
         return self.speed_m_s < 0.01
 
 
-_SECONDS = 2.0  # in which an object that is put down has come to rest
-
-
 def settled_in_mujoco(scene: Path) -> Settled:
     """Load a scene in MuJoCo and let the object come to rest; `Checks.attempt` takes what this raises."""
     mujoco: Any = importlib.import_module("mujoco")  # its types are known only where it is installed
@@ -385,7 +372,7 @@ def settled_in_mujoco(scene: Path) -> Settled:
     mujoco.mj_forward(model, data)
     start = data.xipos[1].copy()
     upright = data.xmat[1].reshape(3, 3)[:, 2].copy()
-    for _ in range(round(_SECONDS / model.opt.timestep)):
+    for _ in range(round(2.0 / model.opt.timestep)):
         mujoco.mj_step(model, data)
     shift = data.xipos[1] - start
     axis = data.xmat[1].reshape(3, 3)[:, 2]
@@ -410,7 +397,7 @@ def settled_in_pybullet(urdf: Path, drop_m: float) -> Settled:
             raise ValueError(str(error)) from error
         start, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
         upright = np.reshape(pybullet.getMatrixFromQuaternion(turn), (3, 3))[:, 2]
-        for _ in range(round(_SECONDS * 240.0)):
+        for _ in range(2 * 240):
             pybullet.stepSimulation(physicsClientId=client)
         place, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
         axis = np.reshape(pybullet.getMatrixFromQuaternion(turn), (3, 3))[:, 2]
@@ -423,7 +410,7 @@ def settled_in_pybullet(urdf: Path, drop_m: float) -> Settled:
 
 def drop_height_m(parts: ConvexParts) -> float:
     """Return the height of the origin at which the lowest vertex of the parts is just above the ground."""
-    return _DROP_M - min(float(vertices_m[:, 2].min()) for vertices_m, _ in parts.meshes)
+    return 0.001 - min(float(vertices_m[:, 2].min()) for vertices_m, _ in parts.meshes)
 
 
 def _angle_deg(one: Array, other: Array) -> float:

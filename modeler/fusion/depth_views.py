@@ -21,9 +21,7 @@ STEEPEST_RAD = 1.40  # steeper steps between neighbouring pixels (80°) are dept
 # Pixels from an edge within which colours may be those of the background: depth and colour are aligned to some pixels.
 # Measured: over six captures the colours of held-out views are predicted best with 6 to 16.
 BLEEDING_PX = 10.0
-OUTLINED = 200  # points of a view from which the error of its outline is taken
 SAMPLES = 20000  # points at which views are compared
-LOOKUPS = 10_000_000  # samples times views, at most, which bounds time
 BATCH = 1 << 18  # points or lookups per kernel call, which bounds memory
 BLOCK_BYTES = 64 * 2**20  # of a block of views, which bounds memory
 BLOCK_VIEWS = 50  # least number in one of several blocks: views vote against outliers of others in their block
@@ -153,10 +151,9 @@ def _margin_px(view: RayImage, covariance: Array | None) -> int:
     A pixel at an outline mixes object and background: the outline is up to half a pixel from its middle, and up to two
     standard deviations of the pose's error farther.
     """
-    points_m = view.points_m[:: max(1, len(view.points_m) // OUTLINED)]
-    if covariance is None or not len(points_m):
+    if covariance is None or not len(view.points_m):
         return 1
-    x, y, z = points_m.T
+    x, y, z = view.points_m.T
     none, one = np.zeros_like(z), np.ones_like(z)
     across = np.stack([np.stack([none, z, -y, one, none, none], 1), np.stack([-z, none, x, none, one, none], 1)], 1)
     moved = np.einsum("nki,ij,nkj->nk", across / z[:, None, None], covariance, across / z[:, None, None])
@@ -428,7 +425,7 @@ def disagreement(views: ViewBlocks, limit_m: float) -> tuple[float, float] | Non
     Returns:
         The standard deviation between two views, and that of one view of weight 1.
     """
-    samples = min(SAMPLES // len(views.blocks), -(-LOOKUPS // views.count))
+    samples = SAMPLES // len(views.blocks)
     off_m, share_m = (np.concatenate(some) for some in zip(*_distances(views, samples, limit_m), strict=True))
     # eq. 12.4
     return (1.4826 * float(np.median(off_m)), 1.4826 * float(np.median(share_m))) if len(off_m) else None

@@ -32,7 +32,6 @@ from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
 # average blurs. Chosen by hand.
 SOFT, SHARP = 4.0, 16.0
 CONFIRMED = 2  # views that see the same surface: thin parts that one view alone sees are errors along its outline
-FOLD_RINGS = 8  # rings of triangles along borders that may fold over; chosen by hand
 HALVES = np.array([0.36, 0.48, 0.8])  # divides directions in two halves; chosen by hand, along no axis
 MIN_NEIGHBOURS = 6  # points of the cloud with fewer in 27 cells of two voxels are outliers; a plane has some 36
 FINEST_PX = 0.01  # smallest voxel, in pixel footprints: a hundred voxels per pixel resolve nothing
@@ -280,7 +279,7 @@ class FusionVolume:
         marked = meshing.gaps_closed(seen, triangles, self.fuser.closing) & ~empty
         # At silhouettes the zero level set folds over: views extrapolate the object one band behind its surface.
         loose = meshing.folded(vertices, normals, seen, marked & ~seen)
-        marked = meshing.without_loose_border(marked, loose, triangles, FOLD_RINGS)
+        marked = meshing.without_loose_border(marked, loose, triangles)
         usual = float(np.median(found.weight[marked])) if marked.any() else 0.0
         confirmed = marked & seen & (found.views >= CONFIRMED)
         kept = meshing.spikes_removed(marked, triangles, self.fuser.opening) | confirmed

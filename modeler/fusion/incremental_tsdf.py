@@ -18,8 +18,7 @@ from modeler.kernels import marching_cubes, tsdf
 from modeler.types import Array, ObjectModel, RayImage
 
 KNOWN = 0.02  # least weight of a known voxel; far above what rounding leaves when a view is removed
-MARGIN_PX = 8  # how far around the object empty space is integrated; chosen by hand
-UNIT = 8  # the box is enlarged in steps of this many voxels
+MARGIN = 8  # pixels around the object in which empty space is integrated, and voxels by which the box is enlarged
 BULK = (0.005, 0.995)  # points outside these quantiles do not enlarge the box
 
 Corner = tuple[int, int, int]
@@ -133,11 +132,11 @@ class IncrementalTsdf:
         """Return the corners, in voxels, of a box around the model and the surface points of these views."""
         lows = [np.array(self.low)] if self.sums.size else []
         highs = [np.array(self.low) + self.sums.shape[:3]] if self.sums.size else []
-        border, unit_m = self.tau_m + 2.0 * self.voxel_m, UNIT * self.voxel_m
+        border, unit_m = self.tau_m + 2.0 * self.voxel_m, MARGIN * self.voxel_m
         for view, pose in pairs:
             low_m, high_m = np.quantile(se3.transform(pose, view.points_m), BULK, axis=0)
-            lows.append(UNIT * np.floor((low_m - border) / unit_m).astype(np.int64))
-            highs.append(UNIT * np.ceil((high_m + border) / unit_m).astype(np.int64))
+            lows.append(MARGIN * np.floor((low_m - border) / unit_m).astype(np.int64))
+            highs.append(MARGIN * np.ceil((high_m + border) / unit_m).astype(np.int64))
         return _corner(np.min(lows, axis=0)), _corner(np.max(highs, axis=0))
 
     def _enlarged(self, low: Corner, high: Corner) -> IncrementalTsdf:
@@ -213,8 +212,8 @@ def _corner(numbers: npt.NDArray[np.int64]) -> Corner:
 def _images(view: RayImage, margin_px: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], Array]:
     """Return a view's surface point numbers, free depth and intrinsics, cropped to the object."""
     camera, depth_m = view.frame.camera, view.frame.depth_m
-    low = np.maximum(view.pixels.min(axis=0) - MARGIN_PX, 0)
-    high = np.minimum(view.pixels.max(axis=0) + MARGIN_PX + 1, depth_m.shape)
+    low = np.maximum(view.pixels.min(axis=0) - MARGIN, 0)
+    high = np.minimum(view.pixels.max(axis=0) + MARGIN + 1, depth_m.shape)
     cropped = depth_m[low[0] : high[0], low[1] : high[1]]
     index = np.full(cropped.shape, -1, dtype=np.int32)
     index[tuple((view.pixels - low).T)] = np.arange(len(view.pixels))

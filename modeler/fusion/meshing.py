@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from modeler.fusion.depth_views import ViewBlocks
 from modeler.kernels import marching_cubes, relief, tsdf
-from modeler.types import Array, BoolArray
+from modeler.types import Array, BoolArray, area_vectors_m2, areas_m2
 
 LEAST_NEIGHBOURS = 15  # of the 26 around a voxel that fill it: more than half, so that open borders do not grow
 FAINT = 1e-3  # weight of a voxel that is filled: known, but next to nothing against an observation
@@ -135,7 +135,6 @@ Triangles = npt.NDArray[np.int64]
 
 # Chosen by hand where nothing else is said.
 RAYLEIGH_MEDIAN = 1.1774  # of the length of two independent normal variables of variance 1
-PINCH_ROUNDS = 50  # at most; a few rounds resolve all pinches of every field tried in the tests
 COLOUR_NEIGHBOURS = 6  # vertices whose colours are interpolated where none was observed
 NORMAL_NEIGHBOURS = 12  # supported vertices whose normals are compared with an unsupported one's
 FOLD_RAD = 0.7  # a surface that turns by more within a few voxels folds over
@@ -153,10 +152,8 @@ FLATTENING_PASSES = 50  # at most, of the smoothing that shows how smoothed view
 def without_pinches(field: DistanceField) -> DistanceField:
     """Return the field with sheets of the zero level set joined that touch along an edge."""
     values, cells = field.values_m, field.cells
-    for _ in range(PINCH_ROUNDS):
-        voxels = marching_cubes.pinched_voxels(values, field.weights, cells)
-        if not len(voxels):
-            break
+    # Voxels are only ever put inside, so that this ends.
+    while len(voxels := marching_cubes.pinched_voxels(values, field.weights, cells)):
         if values is field.values_m:
             values = values.copy()
         values[tuple(voxels.T)] = -PINCH_DEPTH * field.grid.voxel_m
@@ -178,8 +175,7 @@ def extracted_mesh(field: DistanceField) -> tuple[Array, Triangles]:
 
 def normals_of(vertices_m: Array, triangles: Triangles) -> Array:
     """Return unit normals (v, 3): the mean of the triangles around each vertex by area."""
-    corners = vertices_m[triangles]
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = area_vectors_m2(vertices_m, triangles)
     sums = np.stack(
         [
             np.bincount(triangles.ravel(), weights=np.repeat(areas[:, c], 3), minlength=len(vertices_m))
@@ -191,18 +187,12 @@ def normals_of(vertices_m: Array, triangles: Triangles) -> Array:
     return np.where(lengths > 0.0, sums / np.maximum(lengths, 1e-300), [0.0, 0.0, 1.0])
 
 
-def areas_of(vertices_m: Array, triangles: Triangles) -> Array:
-    """Return the areas (t,) of triangles in m²."""
-    corners = vertices_m[triangles]
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-
-
 def large_pieces(vertices_m: Array, triangles: Triangles, min_share: float) -> BoolArray:
     """Return which triangles (t,) belong to connected components of at least `min_share` of the largest one's area."""
     if not len(triangles):
         return np.zeros(0, dtype=bool)
     piece = _piece(triangles, len(vertices_m))
-    area = np.bincount(piece, weights=areas_of(vertices_m, triangles))
+    area = np.bincount(piece, weights=areas_m2(vertices_m, triangles))
     return (area >= min_share * area.max())[piece]
 
 
@@ -218,7 +208,7 @@ def confirmed_pieces(vertices_m: Array, triangles: Triangles, confirmed: BoolArr
     if not len(triangles):
         return np.zeros(0, dtype=bool)
     piece = _piece(triangles, len(vertices_m))
-    areas = areas_of(vertices_m, triangles) * np.all(confirmed[triangles], axis=1)
+    areas = areas_m2(vertices_m, triangles) * np.all(confirmed[triangles], axis=1)
     return (np.bincount(piece, weights=areas) >= least_m2)[piece]
 
 
@@ -281,11 +271,12 @@ def folded(vertices_m: Array, normals: Array, seen: BoolArray, added: BoolArray)
     return found
 
 
-def without_loose_border(marked: BoolArray, loose: BoolArray, triangles: Triangles, rings: int) -> BoolArray:
-    """Return the marked vertices (v,) without loose ones along the border, up to `rings` deep."""
-    outside = ~marked
+def without_loose_border(marked: BoolArray, loose: BoolArray, triangles: Triangles) -> BoolArray:
+    """Return the marked vertices (v,) without loose ones that the border reaches over others."""
+    outside, before = ~marked, -1
     triangles = triangles[np.any(loose[triangles], axis=1)]
-    for _ in range(rings):
+    while (count := np.count_nonzero(outside)) != before:
+        before = count
         outside[triangles[np.any(outside[triangles], axis=1)]] = True
         outside &= ~marked | loose
     return ~outside

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from modeler.types import Array
+from modeler.types import Array, areas_m2
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,7 @@ class SurfacePoints:
         cls, vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, rng: np.random.Generator
     ) -> SurfacePoints:
         """Draw points from triangles (t, 3) of vertices (v, 3), by their area."""
-        one, two, three = np.moveaxis(vertices_m[triangles], 1, 0)
-        areas = np.linalg.norm(np.cross(two - one, three - one), axis=1)
+        areas = areas_m2(vertices_m, triangles)
         picked = rng.choice(len(triangles), count, p=areas / areas.sum())
         u, v = rng.random((2, count))
         u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)

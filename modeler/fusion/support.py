@@ -16,9 +16,8 @@ from modeler.types import Array, BoolArray
 CLIPPED = 12.0  # levels from 0 and from 255 within which a pixel may be clipped: 5 % at either end
 LOOKUPS = 100_000  # points times views at which colours are compared, which bounds time
 ROUNDS = 8  # of iteratively reweighted least squares
-GAIN_SIGMA = 0.05  # prior sd of log gains; halved or doubled, models are the same to 0.1 %
 LEAST = 1e-3  # weight of the shading itself relative to that of the residuals; λ of eq. 12.11
-COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights; halved or doubled, the same
+COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights, and prior sd of log gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +105,7 @@ def _fitted(logs: Array, observed: Array, basis: Array) -> tuple[Array, Array]:
         weighted = weights[..., None] * relief
         across, inner = weighted.sum(axis=1), np.tensordot(weighted, relief, ((0, 1), (0, 1)))
         totals = weights.sum(axis=1)
-        ridge = 1e-3 * (totals.sum() - np.sum(weights * shares)) / len(logs) + (COLOUR_SIGMA / GAIN_SIGMA) ** 2
+        ridge = 1e-3 * (totals.sum() - np.sum(weights * shares)) / len(logs) + 1.0
         solved = _solved(
             totals + ridge, weights, shares, np.concatenate([-np.sum(weights[..., None] * off, axis=1), across], axis=1)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,11 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.fusion.alignment import Matcher, even_rotations
 from modeler.fusion.paint import Paint, SurfacePoints, cielab
-from modeler.types import Array, BoolArray, ObjectModel
+from modeler.system.pictures import raycaster, tensor
+from modeler.types import Array, BoolArray, ObjectModel, area_vectors_m2
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 ORDERS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 16)
 """Orders n of rotations by 360°/n that are tried about the likely axes; about the others, 2 and 3."""
@@ -225,36 +230,27 @@ class _Surface:
     points_m: Array
     normals: Array
     drawn: SurfacePoints
-    scene: object
+    scene: o3d.t.geometry.RaycastingScene
     at_border: BoolArray
     """(t,) triangles next to unknown surface."""
-    closed: bool
     diameter_m: float
 
     @staticmethod
     def of(vertices_m: Array, triangles: npt.NDArray[np.int64], count: int, *, closed: bool) -> _Surface:
-        import open3d as o3d
-
         drawn = SurfacePoints.draw(vertices_m, triangles, count, np.random.default_rng(0))
         points = drawn.of(vertices_m)
-        one, two, three = np.moveaxis(vertices_m[drawn.corners], 1, 0)
-        normals = np.cross(two - one, three - one)
-        scene = o3d.t.geometry.RaycastingScene()
-        tensor = o3d.core.Tensor.from_numpy
-        scene.add_triangles(tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32)))
+        normals, scene = area_vectors_m2(vertices_m, drawn.corners), raycaster(vertices_m, triangles)
         edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         distinct, counts = np.unique(edges, axis=0, return_counts=True)
         border: BoolArray = np.zeros(len(vertices_m), dtype=bool)
         border[distinct[counts == 1].ravel()] = not closed
         extent_m = float(np.linalg.norm(np.ptp(points, axis=0)))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return _Surface(points, normals, drawn, scene, np.any(border[triangles], axis=1), closed, extent_m)
+        return _Surface(points, normals, drawn, scene, np.any(border[triangles], axis=1), extent_m)
 
     def nearest(self, points_m: Array) -> tuple[Array, Array, npt.NDArray[np.int64]]:
         """Return the nearest points (n, 3) on the surface, their normals (n, 3) and triangles (n,)."""
-        import open3d as o3d
-
-        found = self.scene.compute_closest_points(o3d.core.Tensor.from_numpy(points_m.astype(np.float32)))  # pyright: ignore[reportAttributeAccessIssue]
+        found = self.scene.compute_closest_points(tensor(points_m))
         at, normals, numbers = (found[name].numpy() for name in ("points", "primitive_normals", "primitive_ids"))
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         return at.astype(np.float64), normals.astype(np.float64), numbers.astype(np.int64)

@@ -21,10 +21,8 @@ from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are added one by one: all of twelve edges with two modes
 _MAX_OPTIMISED = 8  # hypotheses that are optimised
-_MARGIN_NATS = 15.0  # below the best: hypotheses farther off together weigh less than 4096 exp(-15) = 0.001
 _DECIDED = 0.9999  # weight beyond which the other modes are neglected
 _MAX_EXTRA_OUTLIERS = 1.5  # outlier loops more than the best hypothesis before one is dropped: one loop may be wrong
-_MAX_PAIR_SEARCH = 16  # edges up to which the modes of two of them are changed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,15 +247,13 @@ class _Search:
         return expanded[order], scores[order]
 
     def _neighbours(self, hypothesis: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the hypotheses that differ from one (edges,) in one edge, or in two if there are few edges."""
-        single = [(column, mode) for column, edge in enumerate(self.edges) for mode in range(len(edge.posterior.modes))]
-        changes = [(change,) for change in single]
-        if len(self.edges) <= _MAX_PAIR_SEARCH:
-            changes += [(one, other) for one in single for other in single if one[0] < other[0]]
+        """Return the hypotheses that differ from one (edges,) in one edge."""
+        changes = [
+            (column, mode) for column, edge in enumerate(self.edges) for mode in range(len(edge.posterior.modes))
+        ]
         neighbours = np.tile(hypothesis, (len(changes), 1))
-        for row, change in zip(neighbours, changes, strict=True):
-            for column, mode in change:
-                row[column] = mode
+        for row, (column, mode) in zip(neighbours, changes, strict=True):
+            row[column] = mode
         return neighbours
 
     def _score(self, hypotheses: npt.NDArray[np.int64]) -> Array:
@@ -280,6 +276,5 @@ def _chosen(factor: Factor, modes: Mapping[Edge, int]) -> Factor:
 
 def _near_best(hypotheses: npt.NDArray[np.int64], scores: Array) -> tuple[npt.NDArray[np.int64], Array]:
     """Return the hypotheses (h, edges) with scores (h,) near the best, best first."""
-    order = np.argsort(-scores, kind="stable")
-    order = order[scores[order] >= scores[order[0]] - _MARGIN_NATS][:_BEAM]
+    order = np.argsort(-scores, kind="stable")[:_BEAM]
     return hypotheses[order], scores[order]

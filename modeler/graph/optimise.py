@@ -20,7 +20,6 @@ from modeler.graph.pose_graph import Factor, chain
 from modeler.types import Array
 
 _ANCHOR_SIGMA = 1e-6  # rad and m, of the root: far below any registration's
-_ANNEALING_TOLERANCE = 1e-4  # of the error; the inliers that annealing finds are then solved to convergence
 _RELINEARISE = 1e-3  # rad and m from the linearisation point: relative error of a factor's residual
 _WILDFIRE = 1e-5  # changes in rad and m below which iSAM2 stops back substitution
 MAX_ROUNDS = 8  # of whatever iterates over solutions; if more are needed, the initial value was too far off
@@ -70,7 +69,7 @@ def optimise(
     if inliers(loops, found, threshold) != taking_part:
         gtsam_graph = gtsam_graph_of([*tree, *loops], root)
         trusted = 1 + len(tree)
-        parameters = gtsam.GncLMParams(_parameters(_ANNEALING_TOLERANCE))
+        parameters = gtsam.GncLMParams(_parameters())
         parameters.setLossType(gtsam.GncLossType.TLS)
         parameters.setKnownInliers(list(range(trusted)))
         annealing = gtsam.GncLMOptimizer(gtsam_graph, initial, parameters)
@@ -132,11 +131,11 @@ def _least_squares(gtsam_graph: gtsam.NonlinearFactorGraph, start: gtsam.Values)
     return gtsam.LevenbergMarquardtOptimizer(gtsam_graph, start, _parameters()).optimize()
 
 
-def _parameters(tolerance: float = 1e-12) -> gtsam.LevenbergMarquardtParams:
+def _parameters() -> gtsam.LevenbergMarquardtParams:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky fails if a standard deviation is 4096 times another
-    parameters.setRelativeErrorTol(tolerance)
-    parameters.setAbsoluteErrorTol(tolerance)
+    parameters.setRelativeErrorTol(1e-12)
+    parameters.setAbsoluteErrorTol(1e-12)
     return parameters
 
 

@@ -19,13 +19,7 @@ from modeler import se3
 from modeler.export import bop, solids
 from modeler.export.mesh import TRIANGLES, Texture
 from modeler.export.placing import model_up
-from modeler.export.posed_images import (
-    PosedImages,
-    share_within_masks,
-    write_colmap,
-    write_nerfstudio,
-)
-from modeler.export.solids import triangle_areas
+from modeler.export.posed_images import PosedImages, share_within_masks, write_colmap, write_nerfstudio
 from modeler.export.usd import opened_usd, write_usd
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
 from modeler.runs.outputs import check_files, check_folder, run_inputs
@@ -33,7 +27,7 @@ from modeler.runs.reopening import Reopened, reopened
 from modeler.sequences import finest_unit_mm, write_bop
 from modeler.system.pictures import encoded
 from modeler.system.processes import check_installed
-from modeler.types import Array, InputError, ObjectModel
+from modeler.types import Array, InputError, ObjectModel, areas_m2
 
 SMALLEST_M: Final = 1e-3
 LARGEST_M: Final = 10.0
@@ -92,7 +86,7 @@ def mesh_checks(path: Path, *, unit_m: float = 1.0, most_triangles: int) -> Chec
     mesh = loaded(path)
     corners, triangles = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     size_m = unit_m * np.ptp(corners, axis=0)
-    flat = int(np.count_nonzero(triangle_areas(corners, triangles) * unit_m**2 <= 1e-14))
+    flat = int(np.count_nonzero(areas_m2(corners, triangles) * unit_m**2 <= 1e-14))
     unit = "m" if unit_m == 1.0 else "mm"
     size = " x ".join(f"{length:.3g}" for length in size_m / unit_m)
     return (
@@ -106,9 +100,6 @@ def mesh_checks(path: Path, *, unit_m: float = 1.0, most_triangles: int) -> Chec
 _MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}
 _PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, at most
 _DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
-_SIGMAS: Final = 3.0  # of depth, up to which a point is seen where it was measured
-_WITHIN_MASKS: Final = 0.9  # share of the initial points; some lie at the rim, or behind a hand
-_LEAST_FOOTPRINT: Final = 0.02  # of the box: a smaller footprint is not a flat bottom
 
 Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print", "nerfstudio", "colmap"]
 """Programs for which there are presets."""
@@ -255,7 +246,7 @@ class Preset:
             .also(bool(mesh.is_watertight and mesh.is_winding_consistent), "watertight")
             .also(bool(mesh.volume > 0.0), f"{mesh.volume / 1000.0:.1f} cm³", "it encloses no volume")
             .also(
-                area_m2 > _LEAST_FOOTPRINT * footprint_m2,
+                area_m2 > 0.02 * footprint_m2,
                 f"bottom flat on {1e4 * area_m2:.1f} cm²{how}",
                 f"its bottom is flat on only {1e4 * area_m2:.1f} cm²",
             )
@@ -340,8 +331,9 @@ class Preset:
             place.write(self._points)
             share = share_within_masks(out)
             words = f"{100.0 * share:.0f} % of {len(data.points_m)} points within the masks of {len(poses)} images"
-            return Checks().also(share > _WITHIN_MASKS, words, f"only {words}")
-        tolerance_m = _SIGMAS * max(view.sigma_r_m for view in run.views.values())
+            # Some lie at the rim, or behind a hand.
+            return Checks().also(share > 0.9, words, f"only {words}")
+        tolerance_m = 3.0 * max(view.sigma_r_m for view in run.views.values())
         count = write_colmap(data, out, tolerance_m)
         return Checks().also(count > 0, f"{count} points seen in {len(poses)} images", "no image sees a point")
 

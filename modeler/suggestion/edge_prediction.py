@@ -21,8 +21,10 @@ from modeler.registration.visibility.directed import DirectedLikelihood
 from modeler.registration.visibility.likelihood import MatchNoise, PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.points import FixedPattern
 from modeler.registration.visibility.refinement import Refiner, visible_share
+from modeler.registration.visibility.search import Search
 from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, Edge, InputError, RayImage, Solution
+from modeler.views import Sensor
 
 USUAL_NOISE: Final = 0.66
 """Noise b of matching surfaces before there is an edge, of the sensor's along the ray: 0.59 to 0.70 for 7 shapes."""
@@ -33,19 +35,13 @@ EVEN_ODDS_DEG, ODDS_DEG = 106.0, 21.0
 e-fold: a logistic fit to 475 steps over 48 rendered shapes of the tuning half, 42 of which failed."""
 TURNS_RAD: Final = np.radians(3.0) * np.arange(-60, 60)
 """Turns from the true pose about the table's normal, a posterior's width apart, for the likelihood."""
-_TRUE: Final = 60  # index of the true pose among them
+_TRUE: Final = int(np.argmin(np.abs(TURNS_RAD)))  # index of the true pose among them
 _MODE_TEMPER: Final = 0.3
 """Tempering of the predicted likelihood between modes, so that the true mode's mass is right on average.
 
 Over 175 steps of 35 shapes of the tuning half, the predicted mass of the true mode is 0.76 untempered and 0.61
 tempered; realised 0.63."""
 _CORE_RAD: Final = np.radians(6.0)  # two steps: nearer turns are described by the local Gaussian
-_DESCENT_STEPS: Final = (
-    4  # along the table: with 2 or 8, the masses of 13 of 14 shapes are the same to 0.03; with none they differ
-)
-_DESCENT_NOISE: Final = (
-    0.05  # noise of matching surfaces in these steps, relative to the object's size; 0.02 and 0.1 are as good
-)
 _LARGEST_STEP_RAD: Final = 0.1  # steps do not rotate, because of the damping
 _VALLEY: Final = np.exp(-2.0)  # relative to a mode's peak: separates two Gaussians two standard deviations apart each
 _MAX_EDGES: Final = 6  # newest edges used to scale predictions; they scatter by about a factor of two
@@ -266,7 +262,7 @@ class EdgePredictor:
         some = slice(None, None, max(len(source.unseen_m) // 100, 1))
         points_m = np.einsum("nij,uj->nui", poses[:, :3, :3], source.unseen_m[some]) + poses[:, None, :3, 3]
         normals = np.einsum("nij,uj->nui", poses[:, :3, :3], source.unseen_normals[some])
-        facing = -np.sum(points_m * normals, axis=2) >= 0.35 * np.linalg.norm(points_m, axis=2)
+        facing = -np.sum(points_m * normals, axis=2) >= Sensor.min_cosine * np.linalg.norm(points_m, axis=2)
         return source.unseen_share * facing.mean(axis=1)
 
 
@@ -285,7 +281,8 @@ def turned(pair: PairLikelihood, target_from_source: Array, axis_m: Array, up: A
     none = np.zeros((len(TURNS_RAD), 3))
     poses = se3.moved(target_from_source, np.hstack([TURNS_RAD[:, None] * up, none]), axis_m)
     held = Regulariser(rows(target_from_source), np.zeros((6, 6)), np.repeat([1e9, 1e3], 3), _LARGEST_STEP_RAD)
-    moved = pair.descend(poses, _DESCENT_NOISE * pair.size_m, held, steps=_DESCENT_STEPS)
+    # Noise of 0.02 to 0.1 of the size, and 2 to 8 steps, give the same masses to 0.03; without steps they differ.
+    moved = pair.descend(poses, 0.05 * pair.size_m, held, steps=Search.steps)
     shifts_m = se3.difference(poses, moved, axis_m)[:, 3:]
     shifts_m = shifts_m - (shifts_m @ up)[:, None] * up
     poses = se3.moved(poses, np.hstack([none, shifts_m]), axis_m)

@@ -13,9 +13,7 @@ from modeler.suggestion.belief import Belief, Prediction
 from modeler.suggestion.candidates import Candidate, pokes, turns
 
 _COARSE_DEG, _FINE_DEG = 10.0, 5.0  # between compared turns: turning by hand is not more precise
-_LARGEST_DEG = 180.0
 _LYING_COST = 8.0  # a separate run: a full turn in steps of 45° at least
-_TENTH_DEG = 0.1  # resolution of the text
 _ALIKE = 0.9  # of the better gain: a turn is then equally good either way
 
 
@@ -113,12 +111,9 @@ def suggest(belief: Belief, candidates: Sequence[Candidate] | None = None, goal:
     found.sort(key=lambda each: -each.worth_nats / each.candidate.cost)
     reached = goal.reached(belief)
     ranked = [Suggestion(each, words) for each, words in _in_words(belief, found)]
+    state = belief.seen, belief.pose_deg, belief.sigma_m
     excluded = 0 if candidates is None else len(candidates) - len(found)
-    return Suggestions(tuple(ranked), _summary(belief, ranked, reached=reached), reached, *_state(belief), excluded)
-
-
-def _state(belief: Belief) -> tuple[float, float, float]:
-    return belief.seen, belief.pose_deg, belief.sigma_m
+    return Suggestions(tuple(ranked), _summary(belief, ranked, reached=reached), reached, *state, excluded)
 
 
 def _predicted(belief: Belief, candidates: Sequence[Candidate]) -> list[Prediction]:
@@ -133,8 +128,8 @@ def _default(belief: Belief) -> list[Prediction]:
         belief, [*pokes(belief.last, belief.stand, belief.object_from_last), Candidate("lay", cost=_LYING_COST)]
     )
     if table is not None:
-        return others + _predicted(belief, turns(abs(table.step_deg), _LARGEST_DEG))
-    found = _predicted(belief, turns(_COARSE_DEG, _LARGEST_DEG))
+        return others + _predicted(belief, turns(abs(table.step_deg), 180.0))
+    found = _predicted(belief, turns(_COARSE_DEG, 180.0))
     fine = [
         Candidate("turn", turn_deg=best.candidate.turn_deg + offset_deg)
         for sign in (1.0, -1.0)
@@ -186,7 +181,7 @@ def _action(candidate: Candidate, *, either: bool) -> str:
 def _effect(belief: Belief, found: Prediction) -> str:
     before_deg, after_deg = belief.spin_deg, found.spin_deg
     parts = []
-    if found.edges and after_deg < before_deg - _TENTH_DEG:
+    if found.edges and after_deg < before_deg - 0.1:  # the resolution of the text
         parts.append(f"spin from {_degrees(before_deg)} to {_degrees(after_deg)}")
     elif found.edges:
         parts.append(f"spin known to {_degrees(after_deg)}")

@@ -14,17 +14,17 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import ndtri
 
 from modeler import se3
 from modeler.kernels.photometric import displaced_correlations
 from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage, spread
+from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS
+from modeler.views import Sensor
 
-MAX_VIEWS: Final = 40  # spread over the run: steps of 9° in a full turn
 _PAIRS: Final = 12  # of views that are compared, spread over the run: one has a sd of some 0.1
-_POINTS: Final = 400  # of surface in each
 NEAR_DEG, FAR_DEG = 6.0, 50.0  # rotation between views: highlights stay where they are, and surface is shared
 MIN_SHARED: Final = 60  # points of a pair: the sd of a chance correlation is then 0.13
-_MIN_COSINE: Final = 0.35  # of surface that is reliable, as in registration
 _MARGIN: Final = 4.0  # widths of the fine band: nearer to its outline, a feature is of the background
 _WIDTH: Final = 0.01  # of the object's extent in px: width of the fine band, at least a pixel
 _COARSE: Final = 2.0  # ratio of the widths of the two bands, and of the steps of the search to the finer one
@@ -34,7 +34,6 @@ _REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: b
 _LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
 _CHANCE_SDS: Final = 5.0  # of a correlation by chance: one of 10⁶ places, where several thousand are searched
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
-_NORMAL_QUARTILE: Final = 0.6745  # median magnitude of a standard normal variable
 AT_LEAST: Final = 0.5  # of the correlation elsewhere, and of that one: less is found by chance on few points
 _INNER: Final[WeakKeyDictionary[RayImage, BoolArray]] = WeakKeyDictionary()  # as a view is part of several pairs
 _FEATURES: Final[WeakKeyDictionary[RayImage, tuple[float, np.ndarray]]] = WeakKeyDictionary()  # with the band's width
@@ -138,11 +137,11 @@ class Pair:
         """Return the surface of the second view that the first one sees, too."""
         target, source = views[first], views[second]
         kept = np.flatnonzero(_inside(source, source.pixels))
-        kept = kept[:: max(len(kept) // _POINTS, 1)]
+        kept = kept[:: max(len(kept) // MAX_POINTS, 1)]
         target_from_source = se3.inverse(trajectory[first]) @ trajectory[second]
         points_m, normals = se3.transform(target_from_source, source.points_m[kept]), source.normals[kept]
         facing = -np.sum(points_m * (normals @ target_from_source[:3, :3].T), axis=1)
-        seen = facing >= _MIN_COSINE * np.linalg.norm(points_m, axis=1)
+        seen = facing >= Sensor.min_cosine * np.linalg.norm(points_m, axis=1)
         pixels = np.rint(places_in(target, points_m)[:, ::-1]).astype(int)
         height, width = target.frame.depth_m.shape
         seen &= (pixels >= 0).all(axis=1) & (pixels < (height, width)).all(axis=1)
@@ -299,7 +298,7 @@ class Comparison:
         scores = self.correlations(grid, coarse_px, stride=_STRIDE).mean(axis=1)
         order = np.argsort(-scores, kind="stable")
         some = self.correlations([grid[k] for k in order[:: max(len(order) // 100, 1)]], fine_px).mean(axis=1)
-        chance = float(np.median(np.abs(some))) / _NORMAL_QUARTILE
+        chance = float(np.median(np.abs(some))) / float(ndtri(0.75))  # of normal variables
         groups = {(grid[k].flip, grid[k].scale): k for k in reversed(order)}  # the best shift under each
         tried = [self._refined(grid[k]) for k in groups.values()]
         times = [Displacement(frames=frames) for frames in (-1, 1) if len(self.views) > 2]

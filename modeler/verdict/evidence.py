@@ -55,7 +55,7 @@ MAX_OTHER_MODE: Final = WRONG_SHARE
 """Largest probability that some pair is at another mode: the complement of 95 % regions."""
 
 _DRAWS: Final = 1000  # of a prior: the best of them lies 0.2 nats below the mode of a Gaussian in six dimensions
-_MAX_VIEWS: Final = 40  # compared with each other, spread over the run: 1,600 pairs take a second
+MAX_VIEWS: Final = 40  # compared with each other, spread over the run: 1,600 pairs take a second
 MAX_POINTS: Final = 400  # of each: standard deviation of a share of 0.1 is then 0.015
 _MIN_POINTS: Final = 200  # per frame observed by others: standard deviation of its share is then 0.02
 _MIN_JUDGED: Final = 100  # points of a frame observed by two others or more: a share of 0.02 is two of them
@@ -348,7 +348,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
         tolerance_m: error of the surface above which a model is wrong.
     """
     frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
-    frames = spread(frames, _MAX_VIEWS)
+    frames = spread(frames, MAX_VIEWS)
     reaches_m = {frame: nearest_around(views[frame]) for frame in frames}
     looks, absent = np.zeros((2, len(frames), len(frames))), np.zeros((len(frames), 2))
     surface: list[Array] = []  # by frame: of it in the free space of others, and of others in its free space

@@ -24,7 +24,6 @@ from modeler.types import AbstractPrior, Array, Check, InputError, RayImage, com
 from modeler.verdict.colour_fit import (
     AT_LEAST,
     FAR_DEG,
-    MAX_VIEWS,
     MIN_SHARED,
     NEAR_DEG,
     Comparison,
@@ -32,15 +31,13 @@ from modeler.verdict.colour_fit import (
     has_colour,
     places_in,
 )
-from modeler.verdict.evidence import MAX_POINTS, TAIL_NATS, TOLERANCE, pixels_of
+from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS, TAIL_NATS, TOLERANCE, pixels_of
 
 _CLEAR_DEG: Final = 30.0  # largest rotation at which print of right poses agrees: twelve captures have more than half
-_HALF: Final = 0.5  # of the correlation and of the contrast of prints that agree: less is neither agreement nor plain
 _FAINT: Final = 0.015**2  # variance of a logarithm: a plain body before a strong pattern shows 0.010² of it
 _FLAT_DEG: Final = 25.0  # from their mean: normals of a flat face are noisy, the next face of a body is farther
 _BESIDE: Final = 0.05  # of matching surface that faces elsewhere: right runs 0.05 and more, false matches 0.00 to 0.04
 _AGREEING: Final = 0.8  # cosine of normals that match, as in registration
-_MIN_MATCHES: Final = 60  # points: of fewer, a share of 0.05 is two
 _UPRIGHT: Final = 0.7  # cosine of 45°: a face nearer to the support than to its normal is no side
 
 
@@ -103,7 +100,7 @@ def likenesses(
             continue
         there = _matching(views[first], views[second], some[second], motion, tolerance_m)
         back = _matching(views[second], views[first], some[first], se3.inverse(motion), tolerance_m)
-        known = min(len(there), len(back)) >= _MIN_MATCHES
+        known = min(len(there), len(back)) >= MIN_SHARED
         if not (known or joined):
             continue
         matches = ((there, views[second].normals[some[second]]), (back, views[first].normals[some[first]]))
@@ -193,17 +190,19 @@ def print_check(pairs: Sequence[Likeness]) -> tuple[Likeness, Check] | None:
     """
     printed = [pair for pair in pairs if pair.contrast >= _FAINT]  # NaN where it was not compared
     usual = float(np.quantile([pair.correlation for pair in printed], 0.75)) if printed else 0.0
-    agreeing = [pair for pair in printed if pair.correlation >= _HALF * usual]
+    agreeing = [pair for pair in printed if pair.correlation >= AT_LEAST * usual]
     if usual < AT_LEAST:
         return None
     contrast = float(np.median([pair.contrast for pair in agreeing]))
     group = _groups(pairs, agreeing)
-    apart = [pair for pair in printed if group[pair.first] != group[pair.second] and pair.contrast >= _HALF * contrast]
+    apart = [
+        pair for pair in printed if group[pair.first] != group[pair.second] and pair.contrast >= AT_LEAST * contrast
+    ]
     clear = [pair for pair in apart if pair.angle_deg <= _CLEAR_DEG]
     if len(across := [pair for pair in apart if pair.across]) > 1:  # seen at any angle: one that agrees is enough
         clear.append(max(across, key=lambda pair: pair.correlation))
     worst = min(clear or agreeing, key=lambda pair: pair.correlation)
-    return worst, Check(min(max(worst.correlation, 0.0) / usual, 1.0), _HALF, at_least=True)
+    return worst, Check(min(max(worst.correlation, 0.0) / usual, 1.0), AT_LEAST, at_least=True)
 
 
 def flat_check(
@@ -256,7 +255,7 @@ def _has_rival(pair: Likeness, views: Mapping[int, RayImage], steps: int, prior:
     first, second = views[pair.first], views[pair.second]
     normal = pair.normal / np.linalg.norm(pair.normal)
     axes = [np.cross(normal, along) for along in np.eye(3)]
-    axes = [axis / np.linalg.norm(axis) for axis in axes if np.linalg.norm(axis) > _HALF]
+    axes = [axis / np.linalg.norm(axis) for axis in axes if np.linalg.norm(axis) > 0.5]
     if second.plane is not None:
         if abs(float(normal @ second.plane.normal)) > _UPRIGHT:
             return False
