@@ -11,9 +11,9 @@ import rerun.blueprint as rrb
 from modeler.export.placing import upright
 from modeler.types import Array, RayImage
 from modeler.viz import entities, graph_view, images
+from modeler.viz.drawings import ABOVE_LEFT
 
 _BACKGROUND: Final = (24, 26, 30)
-_ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to the eye; the camera is towards -z, up is -y
 FROM_THE_SIDE: Final = np.array([-0.8, -0.35, -0.5])  # errors along the camera's own axis show from here
 
 
@@ -79,7 +79,7 @@ def _depth(first: RayImage | None) -> rrb.View:
 
 def _object(first: RayImage | None) -> rrb.Container:
     """Return the model, and the merged points before and after closure."""
-    eye = near(first, _ABOVE_LEFT, 3.4)
+    eye = near(first, ABOVE_LEFT, 3.4)
     return rrb.Horizontal(
         spatial("Object model", [f"{entities.WORLD}/model/**"], eye),
         rrb.Vertical(

@@ -18,9 +18,9 @@ from modeler.viz import entities
 Drawing = Iterator[tuple[str, rr.AsComponents]]  # entities in the order in which they are logged
 
 CLEAR: Final = rr.Clear(recursive=False)  # clears an entity
-
-
 POINT_SIZE: Final = rr.Radius.ui_points(1.75)
+VIEW_POINTS: Final = 6_000  # of a view, as drawn: a surface is seen, and what is behind it
+ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to eye or light; the camera is at -z, up is -y
 
 
 def draw_axes() -> Drawing:
@@ -42,7 +42,7 @@ def caption(at_m: Array, words: str, rgb: entities.Rgb) -> rr.Points3D:
 
 def shaded(rgb: entities.Rgb, normals: Array) -> npt.NDArray[np.uint8]:
     """Return RGB (n, 3) of a surface with `normals` (n, 3), lit from above left in the camera frame."""
-    light = 0.35 + 0.65 * np.abs(normals @ np.array([-0.36, -0.48, -0.8]))
+    light = 0.35 + 0.65 * np.abs(normals @ ABOVE_LEFT)
     return np.clip(light[:, None] * np.array(rgb), 0, 255).astype(np.uint8)
 
 

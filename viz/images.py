@@ -21,7 +21,6 @@ from modeler.viz.drawings import CLEAR, Drawing, shown_posterior
 
 _PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
 _DEPTH_PIXELS: Final = 100_000  # the same of depth, which is drawn as points
-_JPEG_QUALITY: Final = 80  # photographs are looked at, not measured
 _DEPTH_UNITS_PER_M: Final = 1000.0  # finer units make the picture no better and the file several times larger
 _RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and small
 
@@ -37,7 +36,7 @@ def draw_outlined(frame: Frame, mask: BoolArray) -> Drawing:
     if frame.colour is None:
         yield entities.COLOUR, CLEAR
     else:
-        jpeg = encoded(frame.colour[::stride, ::stride], "JPEG", quality=_JPEG_QUALITY)
+        jpeg = encoded(frame.colour[::stride, ::stride], "JPEG")
         yield entities.COLOUR, rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=0.0)
     yield entities.DEPTH, _depth_png(frame.depth_m[::coarse, ::coarse], mask[::coarse, ::coarse])
     stride = coarse if frame.colour is None else stride  # the report lays it over the colours, else over the depth

@@ -14,17 +14,17 @@ import rerun.blueprint as rrb
 from modeler import se3
 from modeler.export.mesh import MADE_UP_RGB
 from modeler.tracking import ModelRenderer, Tracked
-from modeler.types import Array, BoolArray, Frame, ObjectModel, RayImage, Step
+from modeler.types import Array, BoolArray, Frame, ObjectModel, RayImage, Step, areas_m2
 from modeler.viz import entities
 from modeler.viz.blueprint import FROM_THE_SIDE, framed, near, spatial
-from modeler.viz.drawings import CLEAR, POINT_SIZE, Drawing, Ellipsoids, rotated, shaded
+from modeler.viz.drawings import CLEAR, POINT_SIZE, VIEW_POINTS, Drawing, Ellipsoids, rotated, shaded
 from modeler.viz.images import draw_outlined, stride_px
 
 if TYPE_CHECKING:
     from modeler.suggestion import Belief, Suggestions
 
 _MODEL_POINTS: Final = 15_000  # of the cloud, which is recorded again at each step
-TRIANGLES: Final = 60_000  # of a mesh as drawn, in a recording or on a page
+TRIANGLES: Final = 60_000  # of a mesh as drawn, in a recording or on a page, and points of all views, recorded once
 _PLAIN: Final = (215, 215, 215)  # surface without colour
 
 
@@ -67,8 +67,7 @@ def coarsened(vertices: Array, triangles: npt.NDArray[np.int64], limit: int) -> 
         triangles: (t, 3) vertex numbers.
         limit: how many triangles may remain.
     """
-    a, b, c = np.moveaxis(vertices[triangles, :3], 1, 0)
-    area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    area_m2 = float(areas_m2(vertices[:, :3], triangles).sum())
     cell_m = max(math.sqrt(1.5 * area_m2 / limit), 1e-9)  # side of a cell that holds two triangles on average
     merged, kept = vertices, triangles
     while len(kept) > limit:
@@ -83,7 +82,6 @@ def coarsened(vertices: Array, triangles: npt.NDArray[np.int64], limit: int) -> 
     return merged, kept
 
 
-_MERGED_POINTS: Final = 60_000  # of all views, recorded once
 _RAMP_RGB: Final = ((70, 100, 255), (40, 190, 190), (255, 225, 60))  # from the first view to the last
 
 
@@ -97,7 +95,7 @@ def draw_merged_clouds(step: Step) -> Drawing:
 def _merged_points(step: Step, poses: Mapping[int, Array]) -> rr.Points3D:
     """Return the points of all views that have a pose, a colour a view from blue to yellow."""
     frames = [frame for frame in sorted(poses) if frame in step.views]
-    stride = math.ceil(max(sum(len(step.views[frame].points_m) for frame in frames), 1) / _MERGED_POINTS)
+    stride = math.ceil(max(sum(len(step.views[frame].points_m) for frame in frames), 1) / TRIANGLES)
     parts = [se3.transform(poses[frame], step.views[frame].points_m[::stride]) for frame in frames]
     along = np.linspace(0.0, 2.0, max(len(frames), 2))[: len(frames)]
     shades = np.stack([np.interp(along, [0.0, 1.0, 2.0], channel) for channel in zip(*_RAMP_RGB, strict=True)], axis=1)
@@ -105,9 +103,6 @@ def _merged_points(step: Step, poses: Mapping[int, Array]) -> rr.Points3D:
     return rr.Points3D(
         np.concatenate([np.zeros((0, 3)), *parts]), colors=colours.astype(np.uint8), radii=rr.Radius.ui_points(1.25)
     )
-
-
-_POINTS: Final = 8_000  # of the object in a frame, recorded for each
 
 
 def draw_tracked_model(model: ObjectModel) -> Drawing:
@@ -132,7 +127,7 @@ def draw_tracked(frame: Frame, found: Tracked, renderer: ModelRenderer) -> Drawi
     if found.view is None:
         yield entities.TRACKED_POINTS, CLEAR
     else:
-        stride = math.ceil(len(found.view.points_m) / _POINTS)
+        stride = math.ceil(len(found.view.points_m) / VIEW_POINTS)
         points_m = found.view.points_m[::stride]
         yield entities.TRACKED_POINTS, rr.Points3D(points_m, colors=entities.SOURCE_RGB, radii=POINT_SIZE)
     yield entities.TRACKED_WORDS, rr.TextDocument(words(found), media_type=rr.MediaType.MARKDOWN)
@@ -164,7 +159,6 @@ SEEN_CELLS: Final = "world/cells/seen"
 UNSEEN_CELLS: Final = "world/cells/unseen"
 SEEN: Final = "next/seen_percent"
 POSE_SD: Final = "next/pose_sd_deg"
-_GREY, _ORANGE = (150, 155, 165), (240, 140, 40)
 
 
 def draw_next(belief: Belief, found: Suggestions) -> Drawing:
@@ -173,8 +167,8 @@ def draw_next(belief: Belief, found: Suggestions) -> Drawing:
     yield WORDS, rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     cells, size_m = belief.cells, 0.5 * belief.cells.cell_m
     open_ = belief.can_be_seen & ~cells.seen & ~cells.under
-    yield SEEN_CELLS, rr.Points3D(cells.points_m[cells.seen], colors=_GREY, radii=size_m)
-    yield UNSEEN_CELLS, rr.Points3D(cells.points_m[open_], colors=_ORANGE, radii=size_m)
+    yield SEEN_CELLS, rr.Points3D(cells.points_m[cells.seen], colors=entities.CAMERA_RGB, radii=size_m)
+    yield UNSEEN_CELLS, rr.Points3D(cells.points_m[open_], colors=entities.SOURCE_RGB, radii=size_m)
     yield SEEN, rr.Scalars(100.0 * found.seen)
     yield POSE_SD, rr.Scalars(found.pose_deg)
 

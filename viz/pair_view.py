@@ -18,6 +18,7 @@ from modeler.viz import entities
 from modeler.viz.drawings import (
     CLEAR,
     POINT_SIZE,
+    VIEW_POINTS,
     Drawing,
     Ellipsoids,
     caption,
@@ -28,9 +29,6 @@ from modeler.viz.drawings import (
     shown_posterior,
 )
 from modeler.viz.readings import worst_axis_sd
-
-_PAIR_POINTS: Final = 6_000  # of a view: a surface is seen, and the other through it
-
 
 _DRAWS: Final = 80  # samples, of which each is still seen by itself
 _LENGTH: Final = 1.1  # of the axes, in distances of the farthest point from the centroid: they stick out of the object
@@ -233,6 +231,6 @@ def below_m(view: RayImage) -> Array:
 
 def _view_points(view: RayImage, target_from_view: Array, rgb: entities.Rgb) -> rr.Points3D:
     """Return the surface points of a view, carried to the target's camera frame."""
-    stride = math.ceil(max(len(view.points_m), 1) / _PAIR_POINTS)
+    stride = math.ceil(max(len(view.points_m), 1) / VIEW_POINTS)
     points = se3.transform(target_from_view, view.points_m[::stride])
     return rr.Points3D(points, colors=shaded(rgb, view.normals[::stride]), radii=POINT_SIZE)

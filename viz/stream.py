@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 _PATIENCE_S: Final = 5.0  # at the end, until viewers have received all data
 _DISK_PATIENCE_S: Final = 60.0  # with a disk that takes nothing
-_STOP_S: Final = 1.0  # until Rerun notices that a viewer has been ended
 _QUEUED: Final = 100  # steps that viewers are behind at most, besides those that Rerun keeps
 _BEGINNING: Final = 4096  # bytes that must fit on the disk to begin with
 
@@ -149,7 +148,7 @@ class Shown:
             _log.info("the viewer did not receive all data")
             self._behind = True
             end_hung()
-            if not _ended((self._sending,), _STOP_S, lambda: 0):
+            if not _ended((self._sending,), viewer.STOP_S, lambda: 0):
                 let_go()
 
     def _send(self) -> None:

@@ -26,9 +26,8 @@ from modeler.types import InputError
 
 _HOST: Final = "127.0.0.1"
 _LOOPBACK: Final = (_HOST, "localhost")
-_REQUEST_S: Final = 30.0  # without a byte, until a connection is closed
-_START_S: Final = 20.0  # until it listens, on a busy machine
-_STOP_S: Final = 3.0  # until it has ended when told to
+PATIENCE_S: Final = 20.0  # until it listens, on a busy machine, or sends a byte
+STOP_S: Final = 3.0  # until it has ended when told to
 # Runs the viewer so that Linux kills it when the process that started it ends, however that ends (prctl, option
 # PR_SET_PDEATHSIG, survives exec). That process may have ended before the option was set.
 _DIE_WITH_PARENT: Final = """\
@@ -75,7 +74,7 @@ class Viewer:
             self.files.server_close()
         self.process.terminate()
         try:
-            self.process.wait(_STOP_S)
+            self.process.wait(STOP_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
@@ -164,7 +163,7 @@ def _start(arguments: list[str], *, port: int, lasting: bool) -> subprocess.Pope
     if not lasting and sys.platform == "linux":
         command = [sys.executable, "-I", "-S", "-c", _DIE_WITH_PARENT, str(os.getpid()), *command]
     process = _child_of_lasting_thread(command)
-    deadline = time.monotonic() + _START_S
+    deadline = time.monotonic() + PATIENCE_S
     while not _listens(_HOST, port, patience_s=0.2):
         if process.poll() is not None or time.monotonic() > deadline:
             process.kill()
@@ -201,7 +200,7 @@ def _child_of_lasting_thread(command: list[str]) -> subprocess.Popen[bytes]:
 class _OneFile(BaseHTTPRequestHandler):
     """Answers every request with one file, for pages of one origin."""
 
-    timeout = _REQUEST_S
+    timeout = PATIENCE_S
 
     def __init__(self, *request: Any, file: Path, origin: str) -> None:
         self._file, self._origin = file, origin

@@ -32,7 +32,6 @@ from modeler.views import Sensor
 IDLE_S: Final = 600.0  # a person who turns an object by hand, and is called away, takes so long at most
 _LEARNT_FROM: Final = 12  # frames; the segmenter asks for about a dozen
 _SENSOR: Final = Sensor(SensorNoise(sigma_r_m=None))  # noise of an unknown camera: a share of the distance
-_END_PX: Final = (5, 250)  # colours beyond are black or saturated, whatever was there
 
 
 class Capture:
@@ -87,9 +86,7 @@ class Capture:
         ]
         if frame.colour is not None:
             light = frame.colour[mask].max(axis=1)
-            dark, bright = (
-                100.0 * float(share) for share in ((light < _END_PX[0]).mean(), (light > _END_PX[1]).mean())
-            )
+            dark, bright = 100.0 * (light < 5).mean(), 100.0 * (light > 250).mean()  # whatever was there
             words.append(f"exposure: {dark:.0f} % of it black, {bright:.0f} % saturated")
         return words
 
@@ -221,7 +218,6 @@ _HOLES: Final = 1e-3  # of all pixels: ten recordings of whole scenes lack 0.01 
 _STEP: Final = 0.1  # of the distance: less is one surface, seen at a slant
 _GHOST_POINTS: Final = 3000  # of each view: of an object of 300 x 300 px, one in 30 pixels
 _GHOST_PX: Final = 3  # closes gaps of 6 px between them, and clears specks as wide
-_OUTER: Final = (2, 98)  # percentiles between which the object lies; pixels at its edges may lie anywhere
 _TURN: Final = re.compile(r"turn by (\d+)°")
 
 
@@ -281,7 +277,8 @@ def ghost(frames: Mapping[int, tuple[Frame, BoolArray]], report: Mapping[str, An
     if not len(points_m):
         return np.zeros((camera.height, camera.width), dtype=bool)
     up = np.asarray(report.get("up") or (0.0, -1.0, 0.0), dtype=np.float64)
-    middle_m = np.percentile(points_m, _OUTER, axis=0).mean(axis=0)  # the mean would lean to what was seen most
+    # Pixels at edges may lie anywhere, and the mean would lean to what was seen most.
+    middle_m = np.percentile(points_m, (2, 98), axis=0).mean(axis=0)
     turn = Rotation.from_rotvec(np.radians(turn_deg) * up)
     turned_m = turn.apply(points_m - middle_m) + middle_m
     newest = poses[placed[-1]]

@@ -27,7 +27,6 @@ _STARTED: Final = re.compile(r"frame \d+")
 # Shares of a build's time: its pass over the frames takes 1 / 2.6 (`modeler.cli.console`), fusing and writing a tenth.
 _FRAMES_END, _PAIRS_END = 0.4, 0.9
 _STARTING_S: Final = 0.05  # in which a process that was begun has the words of its command
-_ENDED: Final = "ended after"
 
 
 @dataclass(frozen=True)
@@ -124,6 +123,10 @@ class Job:
         found = filter(None, map(_LINE.fullmatch, text.splitlines()))
         return [(match[1], match[2], match[3]) for match in found]
 
+    def said(self) -> list[str]:
+        """Return the words of its messages, without those about the command itself."""
+        return [words for _, _, words in self.messages() if not words.startswith(("$ ", "in ", "ended after"))]
+
     @property
     def failure(self) -> str | None:
         """Why it ended without a result, in its own words; None if it did not."""
@@ -136,12 +139,11 @@ class Job:
 
     def progress(self) -> Progress:
         """Return how far it is, as its messages tell."""
-        lines = self.messages()
-        said = [words for _, level, words in lines if not words.startswith(("$ ", "in ", _ENDED))]
+        words = ["starting", *self.said()][-1]
         if not self.frames:
-            return Progress(words=said[-1] if said else "starting")
-        began, done, words, share = None, 0, said[-1] if said else "starting", None
-        for when, _, line in lines:
+            return Progress(words=words)
+        began, done, share = None, 0, None
+        for when, _, line in self.messages():
             if _STARTED.match(line):
                 began = began or when
             if (found := _FRAME.match(line)) is not None:

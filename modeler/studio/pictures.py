@@ -16,7 +16,6 @@ from modeler.viz.entities import OUTLINE_RGB
 from modeler.viz.images import outline
 
 THUMBNAIL_PX: Final = 80  # height of a small picture
-_JPEG_QUALITY: Final = 85  # edges of masks are then free of visible blocks
 
 
 def picture(frame: Frame) -> npt.NDArray[np.uint8]:
@@ -34,7 +33,7 @@ def picture(frame: Frame) -> npt.NDArray[np.uint8]:
 
 def jpeg(frame: Frame) -> bytes:
     """Return a frame as JPEG."""
-    return encoded(picture(frame), "JPEG", quality=_JPEG_QUALITY)
+    return encoded(picture(frame), "JPEG")
 
 
 def thumbnail(frame: Frame, mask: BoolArray | None) -> bytes:
@@ -44,7 +43,7 @@ def thumbnail(frame: Frame, mask: BoolArray | None) -> bytes:
         pixels = np.where(mask[..., None], pixels, pixels // 3)
     image = Image.fromarray(np.ascontiguousarray(pixels.astype(np.uint8)))
     image.thumbnail((4 * THUMBNAIL_PX, THUMBNAIL_PX))
-    return encoded(np.asarray(image), "JPEG", quality=_JPEG_QUALITY)
+    return encoded(np.asarray(image), "JPEG")
 
 
 def outline_svg(mask: BoolArray | None) -> str:

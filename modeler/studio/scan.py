@@ -274,9 +274,7 @@ class Scan:
     def suggested(self) -> str:
         """Return what was suggested to be done next, for the latest run, a line each; "" before."""
         job = self.suggest_job()
-        messages = [
-            words for _, _, words in job.messages() if not words.startswith(("$ ", "in ", "ended ", "preparing"))
-        ]
+        messages = [words for words in job.said() if not words.startswith("preparing")]
         ranked = job.out.read_text().splitlines()[:3] if job.out.exists() else []
         return "\n".join([*ranked, *messages[-1:]])
 
@@ -284,10 +282,7 @@ class Scan:
         """Return what exports have said of their files."""
         found = []
         for log in sorted(self.folder.glob("export-*.log"), key=lambda path: path.stat().st_mtime, reverse=True):
-            words = [
-                words for _, _, words in Job((), log, "").messages() if not words.startswith(("$ ", "in ", "ended "))
-            ]
-            found += words[-1:]
+            found += Job((), log, "").said()[-1:]
         return found
 
     def export_job(self, what: str, *, texture: bool) -> Job:

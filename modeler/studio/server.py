@@ -35,7 +35,7 @@ from modeler.studio.scan import Scan
 from modeler.studio.state import Studio
 from modeler.system.regular_files import check_regular, read_regular
 from modeler.types import InputError
-from modeler.viz.viewer import Viewer, is_loopback, start_web
+from modeler.viz.viewer import PATIENCE_S, Viewer, is_loopback, start_web
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -170,7 +170,6 @@ def _with_headers(send: Send) -> Send:
 HOST: Final = "127.0.0.1"
 _CLOSE_S: Final = 2  # for open connections when the server ends
 _OF_RUN: Final = ("report.html", "recording.rrd")
-_VIEWER_S: Final = 20.0  # for the viewer's largest file, of 40 MB
 _VIEWER_FILE: Final = re.compile(r"[\w.-]{0,64}")
 _ELSEWHERE: Final = re.compile(rb"<link[^>]*https://[^>]*>")
 
@@ -210,7 +209,7 @@ class Viewers:
         if name not in self._files:
             page = self._started().address.partition("?")[0]
             try:
-                with urlopen(f"{page}/{name}", timeout=_VIEWER_S) as answer:
+                with urlopen(f"{page}/{name}", timeout=PATIENCE_S) as answer:
                     content, kind = answer.read(), answer.headers.get_content_type()
             except OSError:
                 return None

@@ -19,6 +19,7 @@ def encoded(pixels: npt.NDArray[Any], kind: Literal["PNG", "JPEG"], **options: A
     from PIL import Image  # many who import this write no picture
 
     buffer = io.BytesIO()
+    options = {"quality": 85, **options} if kind == "JPEG" else options  # edges are then free of visible blocks
     Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, kind, **options)
     return buffer.getvalue()
 

@@ -27,7 +27,7 @@ from modeler.fusion import Fuser, FusionVolume, meshing
 from modeler.fusion.depth_views import free_of
 from modeler.kernels.photometric import harmonics_of
 from modeler.runs.reopening import Reopened, reopened
-from modeler.types import Array, BoolArray, RayImage
+from modeler.types import Array, BoolArray, RayImage, areas_m2
 from studies.surfacing.drawing import Scene
 from studies.surfacing.methods import Surface, open3d_poisson, open3d_tsdf
 
@@ -131,7 +131,7 @@ def tidiness(mesh: Surface, run: Reopened, volume: FusionVolume) -> dict[str, fl
     vertices_m, triangles = mesh
     edges = meshing.boundary_edges(triangles)
     length_m = np.linalg.norm(vertices_m[edges[:, 0]] - vertices_m[edges[:, 1]], axis=1).sum()
-    areas = meshing.areas_of(vertices_m, triangles)
+    areas = areas_m2(vertices_m, triangles)
     figures = {"boundary_cm": 1e2 * float(length_m), "area_cm2": 1e4 * float(areas.sum())}
     up, offset_m = run.report.get("up"), run.report.get("support_offset_m")
     if up is None or offset_m is None:

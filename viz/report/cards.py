@@ -189,7 +189,6 @@ _MANY: Final = 100  # frames, beyond which those are large alone of which someth
 _MARKS_RGB: Final = ((31, 143, 155), (217, 115, 13), (200, 69, 63))
 """Of free space with surface of others, of surface in the free space of others, and of false surface."""
 _COVER: Final = 0.75  # of a mark over the picture
-_JPEG_QUALITY: Final = 82  # a page may hold a hundred
 _BACKGROUND: Final = 250  # grey level around a picture of another shape, as the page has it
 _ROOM: Final = 0.3  # around the object, as a share of its size
 _DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
@@ -297,7 +296,7 @@ def _outlined(
         _mark(pixels, marks, np.array(box) / picture.width * marks.size[1], int(np.count_nonzero(on)))
     line = ndimage.binary_dilation(on) != ndimage.binary_erosion(on, border_value=1)
     pixels[line] = entities.OUTLINE_RGB
-    return _jpeg(pixels.astype(np.uint8))
+    return encoded(pixels.astype(np.uint8), "JPEG", subsampling=0)  # thin lines keep their colour
 
 
 def _mark(pixels: Array, marks: Marks, box: Array, area: int) -> None:
@@ -364,11 +363,7 @@ def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
     inside = ((dots >= 0) & (dots < (width, height))).all(axis=1)
     columns, rows = dots[inside].astype(np.int64).T
     picture[rows, columns] = colours[order][inside]
-    return _jpeg(picture)
-
-
-def _jpeg(pixels: npt.NDArray[np.uint8]) -> bytes:
-    return encoded(pixels, "JPEG", quality=_JPEG_QUALITY, subsampling=0)  # thin lines keep their colour
+    return encoded(picture, "JPEG", subsampling=0)
 
 
 def data_address(content: bytes, kind: str) -> str:

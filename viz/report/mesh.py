@@ -15,9 +15,9 @@ from modeler.export import read_model
 from modeler.export.mesh import sigma_rgb
 from modeler.system.pictures import encoded, raycaster, tensor
 from modeler.types import Array, InputError
+from modeler.viz.drawings import ABOVE_LEFT
 from modeler.viz.model_view import TRIANGLES, coarsened
 
-_ABOVE_LEFT: Final = np.array([-0.5, -0.5, -0.75])
 _STEPS: Final = 32767  # of a coordinate from the centre to the farthest vertex: 16-bit whole numbers
 
 
@@ -159,9 +159,9 @@ def portrait(mesh: Mesh, object_from_upright: Array, size: tuple[int, int]) -> b
 
     `object_from_upright` (3, 3) has right, down and forward as columns.
     """
-    away = object_from_upright @ _ABOVE_LEFT
+    away = object_from_upright @ ABOVE_LEFT
     camera = look_at(mesh.centre_m, away, 4.2 * mesh.radius_m, -object_from_upright[:, 1])
-    return encoded(shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, size), "JPEG", quality=85)
+    return encoded(shade(mesh.vertices_m, mesh.triangles, mesh.colours, camera, size), "JPEG")
 
 
 def look_at(centre_m: Array, direction: Array, distance_m: float, up: Array) -> Array:

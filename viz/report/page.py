@@ -21,12 +21,12 @@ from modeler.export.placing import model_up, model_upright
 from modeler.fusion import Symmetries, SymmetryFinder
 from modeler.types import ACCEPTED, Array, InputError, Outcome, loops_closed
 from modeler.verdict.advice import contradicted_focal_length
+from modeler.viz.drawings import VIEW_POINTS
 from modeler.viz.report import plots
 from modeler.viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
 from modeler.viz.report.mesh import Mesh, portrait, read_mesh, scene
 from modeler.viz.report.run_data import Result, Row, recorded, surfaces
 
-_SHAPE_POINTS: Final = 6_000  # a silhouette needs no more
 _CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
 _SYMMETRIES: Final = (
     "Rotations that map the model onto itself: in any two of these poses it looks the same, so that a pose estimator "
@@ -161,7 +161,7 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
 def _trajectory(result: Result, mesh: Mesh | None, centre_m: Array) -> Sequence[str]:
     """Return the camera poses and their uncertainty."""
     shape_m = np.zeros((0, 3)) if mesh is None else mesh.vertices_m
-    shape_m = shape_m[:: max(len(shape_m) // _SHAPE_POINTS, 1)]
+    shape_m = shape_m[:: max(len(shape_m) // VIEW_POINTS, 1)]
     return [
         "<h2>Camera poses</h2>",
         figure(
