@@ -130,7 +130,7 @@ def _draws_needed(agreement: float) -> float:
     return 0.0 if chance >= 1.0 else float(np.log(0.001) / np.log1p(-chance)) if chance > 0.0 else np.inf
 
 
-_REFINEMENT = IcpRegistrar(voxels=FINE)
+REFINEMENT = IcpRegistrar(voxels=FINE)
 """Without coarse levels, which could leave the basin of a good initial pose."""
 
 
@@ -142,7 +142,7 @@ class FpfhIcpRegistrar(AbstractCloudRegistrar):
         """Return the local optimum from the motion of the feature matches."""
         clouds = Cloud.of(source), Cloud.of(target)
         coarse = FpfhRegistrar().search(*clouds, initial, rng)
-        return None if coarse is None else _REFINEMENT.refine(*clouds, coarse.target_from_source)
+        return None if coarse is None else REFINEMENT.refine(*clouds, coarse.target_from_source)
 
 
 KISS_MISSING = f"KISS-Matcher is not installed; install it with: {install_command('peers')}"
@@ -173,7 +173,7 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
         clouds = Cloud.of(source), Cloud.of(target)
         if min(len(cloud.points_m) for cloud in clouds) < self.min_points:
             return None
-        return _REFINEMENT.refine(*clouds, self.search(*clouds, initial))
+        return REFINEMENT.refine(*clouds, self.search(*clouds, initial))
 
     def search(self, source: Cloud, target: Cloud, fallback: Array) -> Array:
         """Return the motion (4, 4) that KISS-Matcher finds; `fallback` (4, 4) if it finds none."""

@@ -11,8 +11,9 @@ from typing import Any, Final, final
 import numpy as np
 
 from modeler import se3
-from modeler.baselines import FpfhIcpRegistrar, IcpRegistrar
+from modeler.baselines import FpfhRegistrar, IcpRegistrar
 from modeler.baselines.clouds import Cloud
+from modeler.baselines.fpfh import REFINEMENT
 from modeler.fusion.paint import SurfacePoints
 from modeler.types import Array, ObjectModel, RayImage
 
@@ -64,10 +65,9 @@ class Answer:
 
 def fpfh_icp(thing: ModelCloud, view: RayImage, last: Array) -> Answer | None:
     """Return FPFH with RANSAC, then ICP; the last pose is not used."""
-    rng, method = np.random.default_rng(0), FpfhIcpRegistrar()
     clouds = Cloud.of(view), thing.cloud
-    coarse = method.fpfh.search(*clouds, np.eye(4), rng)
-    fit = None if coarse is None else method.icp.refine(*clouds, coarse.target_from_source)
+    coarse = FpfhRegistrar().search(*clouds, np.eye(4), np.random.default_rng(0))
+    fit = None if coarse is None else REFINEMENT.refine(*clouds, coarse.target_from_source)
     return None if fit is None else Answer(se3.inverse(fit.target_from_source), fit.fitness > _FITNESS)
 
 
