@@ -36,7 +36,7 @@ def log(pose: Array) -> Array:
     return lie_group.logarithms(pose.reshape(-1, 4, 4)).reshape(*pose.shape[:-2], 6)
 
 
-def is_rigid(matrix: Array, *, tolerance: float, farthest_m: float) -> bool:
+def is_rigid(matrix: Array, *, tolerance: float, farthest_m: float = 1e6) -> bool:
     """Return whether a matrix (4, 4) of whatever numbers, NaN among them, is a rigid motion.
 
     Args:

@@ -211,7 +211,6 @@ MASK_FOLDERS = ("masks", "mask")
 OCCLUDER_FOLDERS = ("mask_hand", "masks_hand")
 CONFIDENCE_FOLDERS = ("confidence",)
 POSES = "annotated_poses"
-FARTHEST_M = 1e6  # largest plausible coordinate of a camera in m
 
 
 @dataclass(frozen=True)
@@ -401,6 +400,6 @@ def _rigid(rows: list[list[str]], path: Path) -> Array:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
         matrix = np.zeros(0)
-    if matrix.shape == (4, 4) and se3.is_rigid(matrix, tolerance=1e-2, farthest_m=FARTHEST_M):
+    if matrix.shape == (4, 4) and se3.is_rigid(matrix, tolerance=1e-2):
         return matrix
     raise InputError(f"{path}: is no rigid motion; write four rows of four numbers, the last 0 0 0 1.")

@@ -350,7 +350,7 @@ _PAD = ((0, _GAP), (0, _GAP), (0, 0))
 
 def _images(frame: Frame) -> list[npt.NDArray[np.uint8]]:
     """Return the images (h, w, 3) of a row."""
-    depth = _shaded(frame)
+    depth = shaded_depth(frame)
     over = (depth if frame.colour is None else frame.colour).copy()
     over[depth_edges(frame.depth_m)] = _EDGE
     if frame.mask is None:
@@ -358,8 +358,8 @@ def _images(frame: Frame) -> list[npt.NDArray[np.uint8]]:
     return [depth, over, np.where(frame.mask[..., None], depth, depth // 4).astype(np.uint8)]
 
 
-def _shaded(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Return depth as an image (h, w, 3), black where nothing was measured."""
+def shaded_depth(frame: Frame) -> npt.NDArray[np.uint8]:
+    """Return depth as an image (h, w, 3), from near (light) to far (dark), black where nothing was measured."""
     measured = measured_pixels(frame)
     image = np.zeros((*frame.depth_m.shape, 3), np.uint8)
     if measured.any():

@@ -199,7 +199,7 @@ def test_a_mean_far_from_the_prior_is_believed_only_where_loops_tell_it(sigma: f
         step = 0.07 if log_factor == 0.0 else 0.02
         return FocalLength(step, sigma, prior_sigma=0.02, loops=1, sigmas_before=3.0, sigmas_after=2.0, by_focal={})
 
-    found = estimate_focal_length(estimate_at, rounds=3, tolerance=1.0, reach=0.1)
+    found = estimate_focal_length(estimate_at, reach=0.1)
     assert (found.log_factor > 0.08, found.determined_by) == ((True, "loop") if believed else (False, "prior"))
     if not believed:
         assert (found.log_factor, found.sigma) == (0.0, 0.02)
@@ -216,7 +216,7 @@ def test_steps_that_are_too_short_are_followed_to_where_they_end(share: float) -
         sigma = float(np.hypot(0.004, 0.003))
         return FocalLength(step, sigma, 0.05, 9, sigmas_before=3.0, sigmas_after=1.0, by_focal={}, noise_sigma=0.003)
 
-    found = estimate_focal_length(estimate_at, rounds=5, tolerance=0.25, reach=0.1)
+    found = estimate_focal_length(estimate_at, reach=0.1)
     assert found.log_factor == pytest.approx(true, abs=1e-9)
     assert len(asked) <= 3
     assert found.sigma == pytest.approx(np.hypot(0.004, 0.003 / share))

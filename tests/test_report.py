@@ -115,7 +115,8 @@ def test_the_evidence_is_explained_and_stands_beside_its_limits(run: Path, page:
     assert section.count("</td></tr>") == len(evidence)
     assert set(evidence) <= set(CHECKS)
     for name in evidence:
-        assert f"<th>{escape(CHECKS[name].words)}<p class='quiet'>{escape(CHECKS[name].why)}</p></th>" in section
+        words, why, _ = CHECKS[name]
+        assert f"<th>{escape(words)}<p class='quiet'>{escape(why)}</p></th>" in section
     assert re.search("unsure mask.*</th><td>0 %</td><td class='quiet'>at most 50 %</td><td>holds", section)
     assert "at least" in section
     older = tmp_path / "older"

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from modeler.cli.console import say
 from modeler.composition.options import SEED, default
+
+if TYPE_CHECKING:
+    from modeler.types import Verdict
 
 
 @dataclass(frozen=True)
@@ -47,15 +50,12 @@ class Edit:
             raise InputError(
                 f"{self.run_folder}: no frame would be taken out; name some of {frames[0]} to {frames[-1]}"
             )
-        done = edit(self.run_folder, dropped, out, overwrite=self.overwrite)
-        left = len(done.report["poses"])
+        report, verdict, unconnected = edit(self.run_folder, dropped, out, overwrite=self.overwrite)
+        left = len(report["poses"])
         say(f"{len(dropped)} of {len(frames)} frames taken out, {left} left: {out}")
-        if done.unconnected:
-            names = ", ".join(map(str, done.unconnected))
-            say(f"left out, too, as nothing else joins them to the rest: {names}")
-        if done.verdict.reasons:
-            say(f"not to be trusted: {done.verdict.reasons[0]}")
-        return 0 if done.verdict.trustworthy else 3
+        if unconnected:
+            say(f"left out, too, as nothing else joins them to the rest: {', '.join(map(str, unconnected))}")
+        return _status(verdict)
 
 
 def _numbers(text: str, frames: Sequence[int]) -> list[int]:
@@ -102,15 +102,21 @@ class Join:
         from modeler.runs.joining import join
 
         _check(self)
-        joined = join(self.run_a, self.run_b, self.out, pairs=self.pairs, seed=self.seed, overwrite=self.overwrite)
-        best, *others = joined.alignments
+        (best, *others), report, verdict = join(
+            self.run_a, self.run_b, self.out, pairs=self.pairs, seed=self.seed, overwrite=self.overwrite
+        )
         ways = f", of {len(others) + 1} ways" if others else ""
         say(f"models aligned: {100.0 * best.share:.3g} % likely{ways}")
-        frames = len(joined.report["poses"])
+        frames = len(report["poses"])
         say(f"{best.accepted} of {len(best.edges)} pairs registered, {frames} frames joined: {self.out}")
-        if joined.verdict.reasons:
-            say(f"not to be trusted: {joined.verdict.reasons[0]}")
-        return 0 if joined.verdict.trustworthy else 3
+        return _status(verdict)
+
+
+def _status(verdict: Verdict) -> int:
+    """Say why a model is not to be trusted, and return the exit status."""
+    if verdict.reasons:
+        say(f"not to be trusted: {verdict.reasons[0]}")
+    return 0 if verdict.trustworthy else 3
 
 
 def _check(options: Join) -> None:

@@ -138,7 +138,7 @@ def write_colmap(data: PosedImages, folder: Path, tolerance_m: float) -> int:
     Its points are those of the surface that a frame sees, and their observations are projections, no matched features.
     """
     numbers: dict[Camera, int] = {}
-    images: list[_Image] = []
+    images: list[tuple[str, bytes]] = []
     tracks: dict[int, list[tuple[int, int]]] = {}
     for number, frame in data.frames.items():
         name = f"{number:06d}.png"
@@ -148,7 +148,13 @@ def write_colmap(data: PosedImages, folder: Path, tolerance_m: float) -> int:
         for row, point in enumerate(points.tolist()):
             tracks.setdefault(point, []).append((number + 1, row))
         camera_from_world = se3.inverse(data.world_from_camera[number])
-        images.append(_Image(number + 1, camera, name, camera_from_world, points + 1, places + _PIXEL_CENTRE))
+        x, y, z, w = Rotation.from_matrix(camera_from_world[:3, :3]).as_quat(canonical=True).tolist()
+        pose = (w, x, y, z, *camera_from_world[:3, 3].tolist())
+        columns, rows = (places + _PIXEL_CENTRE).T
+        seen = np.rec.fromarrays([columns, rows, points + 1], dtype=[("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
+        words = " ".join(f"{column!r} {row!r} {point}" for column, row, point in seen.tolist())
+        head = struct.pack("<I7dI", number + 1, *pose, camera) + name.encode() + b"\0" + struct.pack("<Q", len(seen))
+        images.append((f"{number + 1} {_words(*pose)} {camera} {name}\n{words}\n", head + seen.tobytes()))
     tracks = dict(sorted(tracks.items()))
     sparse = folder / "sparse" / "0"
     text, binary = [""] * 3, [struct.pack("<Q", len(part)) for part in (numbers, images, tracks)]
@@ -156,9 +162,8 @@ def write_colmap(data: PosedImages, folder: Path, tolerance_m: float) -> int:
         values = camera.fx, camera.fy, camera.cx + _PIXEL_CENTRE, camera.cy + _PIXEL_CENTRE
         text[0] += f"{number} PINHOLE {camera.width} {camera.height} {_words(*values)}\n"
         binary[0] += struct.pack("<iiQQ4d", number, _PINHOLE, camera.width, camera.height, *values)
-    for image in images:
-        text[1] += image.text()
-        binary[1] += image.binary()
+    text[1] += "".join(words for words, _ in images)
+    binary[1] += b"".join(packed for _, packed in images)
     lines, records = [], []
     for point, track in tracks.items():
         place, rgb = data.points_m[point].tolist(), data.colours[point].tolist()
@@ -170,38 +175,6 @@ def write_colmap(data: PosedImages, folder: Path, tolerance_m: float) -> int:
         write_atomically(sparse / f"{name}.txt", words)
         write_atomically(sparse / f"{name}.bin", data_bytes)
     return len(tracks)
-
-
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """An image of a COLMAP model."""
-
-    number: int
-    camera: int
-    name: str
-    camera_from_world: Array
-    points: npt.NDArray[np.int64]
-    """(k,) numbers of the points that it sees."""
-    places: Array
-    """(k, 2) where, in px from the image's corner."""
-
-    @property
-    def pose(self) -> tuple[float, ...]:
-        """Quaternion, w first, and translation."""
-        x, y, z, w = Rotation.from_matrix(self.camera_from_world[:3, :3]).as_quat(canonical=True).tolist()
-        return (w, x, y, z, *self.camera_from_world[:3, 3].tolist())
-
-    def text(self) -> str:
-        """Return two lines: the pose, and what is seen."""
-        seen = " ".join(f"{x!r} {y!r} {point}" for (x, y), point in zip(self.places.tolist(), self.points, strict=True))
-        return f"{self.number} {_words(*self.pose)} {self.camera} {self.name}\n{seen}\n"
-
-    def binary(self) -> bytes:
-        """Return the same as COLMAP packs it."""
-        seen = np.zeros(len(self.points), dtype=[("place", "<f8", (2,)), ("point", "<u8")])
-        seen["place"], seen["point"] = self.places, self.points
-        head = struct.pack("<I7dI", self.number, *self.pose, self.camera)
-        return head + self.name.encode() + b"\0" + struct.pack("<Q", len(seen)) + seen.tobytes()
 
 
 def _words(*numbers: float) -> str:

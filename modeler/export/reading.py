@@ -17,7 +17,7 @@ from modeler.system.regular_files import read_regular
 from modeler.types import Array, Edge, EdgeKind, InputError, Mode, ObjectModel, Outcome, PoseGaussian, Posterior, Stated
 
 Test = Callable[[Any], bool]
-_FARTHEST_M, _WIDEST, _NARROWEST = 1e6, 1e9, 1e-30  # of places and variances that can be computed with
+_WIDEST, _NARROWEST = 1e9, 1e-30  # variances that can be computed with
 _ROUND = 1e-6  # to which rotations and directions survive being written
 
 
@@ -169,7 +169,7 @@ def _impossible(record: Mapping[str, Any]) -> str | None:
 
 def _rigid(numbers: list[float | None]) -> bool:
     pose = np.array(numbers, dtype=np.float64).reshape(4, 4)
-    return se3.is_rigid(pose, tolerance=_ROUND, farthest_m=_FARTHEST_M)
+    return se3.is_rigid(pose, tolerance=_ROUND)
 
 
 def _definite(numbers: list[float | None], least: float) -> bool:

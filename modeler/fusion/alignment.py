@@ -35,16 +35,12 @@ class Matcher:
     """Initial rotations, evenly spread over SO(3)."""
     points: int = 300
     """Points of the source used by ICP."""
-    scored_points: int = 1500
-    """Number of points of each model at which views are compared."""
     steps: int = 15
     """ICP iterations; the largest distance of correspondences shrinks from a third of the object to a fiftieth."""
     scored: int = 40
     """Number of ICP results ranked by the views."""
     apart_rad: float = 0.25
     """Matches closer than this in rotation are duplicates."""
-    colour_level: float = 40.0
-    """Difference of colours, in levels of 255, beyond which they disagree."""
 
     def matches(
         self, target: FusionVolume, source: FusionVolume, models: tuple[ObjectModel, ObjectModel]
@@ -97,13 +93,13 @@ class Matcher:
 
     def _agreement(self, model: ObjectModel, volume_from_model: Array, volume: FusionVolume) -> float:
         """Return the mean score of one model's surface in the views of the other."""
-        chosen = np.linspace(0, len(model.points_m) - 1, min(self.scored_points, len(model.points_m))).astype(np.int64)
+        chosen = np.linspace(0, len(model.points_m) - 1, min(1500, len(model.points_m))).astype(np.int64)
         points = se3.transform(volume_from_model, model.points_m[chosen])
         observed = volume.support(points, model.normals[chosen] @ volume_from_model[:3, :3].T)
         scores = np.where(observed.views > 0, 1.0, 0.0)
         if model.colours is not None:
             off = np.linalg.norm(observed.colours.astype(float) - model.colours[chosen].astype(float), axis=1)
-            alike = np.exp(-((off / self.colour_level) ** 2))
+            alike = np.exp(-((off / 40.0) ** 2))  # in levels of 255, beyond which colours disagree
             scores = np.where((observed.views > 0) & observed.coloured, 0.5 + 0.5 * alike, scores)
         return float(np.mean(scores - ((observed.views == 0) & (observed.empty_views > 0.0))))
 

@@ -49,8 +49,6 @@ class Fuser:
     """Side of a voxel in m; None: the footprint of a pixel, or half the sensor's noise if that is larger."""
     max_voxels: int = 192**3
     """Memory bound: voxels are enlarged until the object's box holds at most this many."""
-    preview_voxels: float = 2.5
-    """Side of a voxel of the preview, in voxels of the model: as many points as the viewer shows of an object."""
     preview_limit: int = 128**3
     """Memory bound of the preview, as `max_voxels`."""
     preview_moves: int = 8
@@ -72,8 +70,6 @@ class Fuser:
     """Spikes and strips along open borders narrower than about twice this many voxels are removed."""
     fairing: int = 10
     """Passes of Taubin smoothing."""
-    min_piece: float = 0.01
-    """Connected components of the mesh smaller than this share of the largest one's area are removed."""
 
     def fuse(
         self,
@@ -252,7 +248,7 @@ class FusionVolume:
         vertices, triangles = meshing.extracted_mesh(field)
         kept, confirmed, weak, sigmas_m = self._kept(vertices, triangles)
         shown = triangles[np.all(kept[triangles], axis=1)]
-        large = meshing.large_pieces(vertices, shown, self.fuser.min_piece)
+        large = meshing.large_pieces(vertices, shown)
         shown = shown[large | meshing.confirmed_pieces(vertices, shown, confirmed, self.near_m**2)]
         used, compact = meshing.used_vertices(shown, len(vertices))
         if watertight:

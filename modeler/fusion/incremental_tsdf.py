@@ -68,7 +68,8 @@ class IncrementalTsdf:
             InputError: if no view with surface points has a pose.
         """
         pairs = {view.index: (view, pose) for view, pose in posed_views(views, trajectory) if len(view.points_m)}
-        voxel_m = self.voxel_m or self.fuser.preview_voxels * self.fuser.voxel_side_m(list(pairs.values()))
+        # As many points as the viewer shows of an object.
+        voxel_m = self.voxel_m or 2.5 * self.fuser.voxel_side_m(list(pairs.values()))
         after = self if self.voxel_m else replace(self, voxel_m=voxel_m)
         new = [frame for frame in pairs if frame not in self.integrated]
         moved_m = _shifts_m(pairs, self.integrated)
@@ -103,7 +104,7 @@ class IncrementalTsdf:
         known = weights > 0.0
         values = np.where(known, self.sums[..., 1] / np.where(known, weights, 1.0), 0.0).astype(np.float32)
         positions, triangles = marching_cubes.extract(values, weights, crossed(values))
-        shown = triangles[meshing.large_pieces(positions, triangles, self.fuser.min_piece)]
+        shown = triangles[meshing.large_pieces(positions, triangles)]
         used, shown = meshing.used_vertices(shown, len(positions))
         positions = positions[used]
         vertices_m = (np.array(self.low) + positions + 0.5) * self.voxel_m

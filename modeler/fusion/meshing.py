@@ -187,13 +187,13 @@ def normals_of(vertices_m: Array, triangles: Triangles) -> Array:
     return np.where(lengths > 0.0, sums / np.maximum(lengths, 1e-300), [0.0, 0.0, 1.0])
 
 
-def large_pieces(vertices_m: Array, triangles: Triangles, min_share: float) -> BoolArray:
-    """Return which triangles (t,) belong to connected components of at least `min_share` of the largest one's area."""
+def large_pieces(vertices_m: Array, triangles: Triangles) -> BoolArray:
+    """Return which triangles (t,) belong to connected components of at least 1 % of the largest one's area."""
     if not len(triangles):
         return np.zeros(0, dtype=bool)
     piece = _piece(triangles, len(vertices_m))
     area = np.bincount(piece, weights=areas_m2(vertices_m, triangles))
-    return (area >= min_share * area.max())[piece]
+    return (area >= 0.01 * area.max())[piece]
 
 
 def confirmed_pieces(vertices_m: Array, triangles: Triangles, confirmed: BoolArray, least_m2: float) -> BoolArray:

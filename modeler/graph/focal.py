@@ -132,13 +132,7 @@ class MovingGraph:
         return {}
 
 
-def estimate_focal_length(
-    estimate_at: Callable[[float], FocalLength],
-    *,
-    reach: float,
-    rounds: int = _REGISTRATIONS,
-    tolerance: float = _CONVERGED,
-) -> FocalLength:
+def estimate_focal_length(estimate_at: Callable[[float], FocalLength], *, reach: float) -> FocalLength:
     """Return the focal length, estimated iteratively from edges registered under each estimate (method, eq. 10.5).
 
     The derivatives hold near the focal length of the edges only, so that first steps may be too short. The secant
@@ -148,17 +142,15 @@ def estimate_focal_length(
         estimate_at: returns the estimate by edges registered under a focal length, relative to it; its argument is the
             logarithm of this focal length over the given one.
         reach: largest absolute logarithm.
-        rounds: largest number of registrations of the edges.
-        tolerance: step in standard deviations below which the iteration ends.
     """
     first = estimate = estimate_at(0.0)
     centre, share = 0.0, 1.0
-    for number in range(rounds):
+    for number in range(_REGISTRATIONS):
         if not estimate.loops:  # their edges cannot be registered under the estimate
             return replace(estimate, log_factor=0.0, sigma=estimate.prior_sigma)
         before, step = centre, estimate.log_factor
         centre = float(np.clip(before + step / share, -reach, reach))
-        if abs(step) <= tolerance * estimate.sigma or centre == before or number == rounds - 1:
+        if abs(step) <= _CONVERGED * estimate.sigma or centre == before or number == _REGISTRATIONS - 1:
             break
         estimate = estimate_at(centre)
         if abs(centre - before) > estimate.sigma:  # in less, the noise of registrations would show
@@ -176,7 +168,7 @@ def estimate_focal_length(
 Register = Callable[[RayImage, RayImage, AbstractPrior], Posterior]
 """Returns the posterior of target_from_source of a source and a target view under a prior."""
 
-_LIMIT_STEPS = 2.0  # steps for which limits hold, as where a run places a view that one step's do not
+LIMIT_STEPS = 2.0  # steps for which limits hold where the graph predicts the motion, so that they do not truncate it
 
 
 @dataclass(frozen=True)
@@ -210,7 +202,7 @@ class FocalCalibrator:
             register: as the run did.
             prior: of the run.
         """
-        known, root = prior.relaxed(_LIMIT_STEPS), min(views)
+        known, root = prior.relaxed(LIMIT_STEPS), min(views)
         # Unsure, so that registrations tell how they follow it.
         unsure = replace(sensor, noise=sensor.noise._replace(sigma_focal=self.prior_sigma))
         taking_part = [edge for edge in edges if {edge.source, edge.target} <= views.keys() and _counts(edge)]

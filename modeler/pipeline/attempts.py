@@ -18,6 +18,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure import Closer
+from modeler.graph.focal import LIMIT_STEPS
 from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, converged_or
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
@@ -42,7 +43,6 @@ FULL: Final = 1.0
 """Effort of a registration that may become an edge."""
 
 _LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
-_SPAN_STEPS = 2.0  # steps of the limits if the graph predicts the motion, so that they do not truncate it
 _UNEVEN_SHARE = 0.25  # of the way: standard deviation in the middle between two views, if the speed is uneven
 _MIN_OVERLAP_GAIN = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
 _SEPARATE_RAD = 0.26  # registrations that differ by a larger rotation are two modes
@@ -267,7 +267,7 @@ def predicted(
         far: whether limits are those of several steps also for small rotations.
     """
     far |= bool(np.degrees(se3.rotation_angle(motion.mean)) > search.closer.max_angle_deg)
-    within, unlimited = prior.relaxed(_SPAN_STEPS) if far else prior, prior.unlimited()
+    within, unlimited = prior.relaxed(LIMIT_STEPS) if far else prior, prior.unlimited()
     if unlimited is not None:  # limits that are defaults
         with suppress(InputError):  # registering says so
             if not _inside(within.between(search.view, search.state.views[target]), motion.mean[None])[0]:

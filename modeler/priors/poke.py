@@ -12,7 +12,7 @@ from modeler.priors.table import WOBBLE_DEG, WOBBLE_M, OnPlane, TablePrior, on_p
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError, RayImage, checked
 from modeler.types.base import check_parameters
 
-_STEPS = 20  # integration steps of a push
+STEPS = 20  # integration steps of a push
 _PUSHES = 512  # samples of a push
 _MIN_IN_PLANE = 0.1  # component of a direction in the plane: within six degrees of the normal it is an error
 
@@ -120,7 +120,7 @@ class PokePrior(AbstractPrior):
         contact = along_push @ in_plane @ np.array(poke.point_m) + self.poke_sigma_m * noise[:, 3:5]
         bearing = np.radians(self.poke_sigma_deg) * noise[:, 5]
         length_m = np.maximum(poke.length_m + self.poke_sigma_m * noise[:, 6], 0.0)
-        step = (length_m / _STEPS)[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        step = (length_m / STEPS)[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
         turn, shift = pushed(contact - centre, step, radius_m)
         # The centre of friction moves by `shift`; the centroid also turns about it.
         lever = seen.mean(axis=0) - centre
@@ -173,7 +173,7 @@ def pushed(contact_m: Array, step_m: Array, radius_m: Array) -> tuple[Array, Arr
     """
     turn, shift, contact_m = np.zeros(len(contact_m)), np.zeros_like(contact_m), contact_m.copy()
     squares = radius_m**2
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         x, y = contact_m.T
         u, w = step_m.T
         total = squares + x**2 + y**2

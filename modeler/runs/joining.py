@@ -25,20 +25,12 @@ from modeler.verdict import judged
 from modeler.viz.stream import open_stream
 
 
-@dataclass(frozen=True, eq=False)
-class Joined:
-    """Result of joining two runs."""
-
-    alignments: Sequence[Alignment]
-    """Of their models, the likeliest first; that one was used."""
-    report: Mapping[str, Any]
-    """As in report.json."""
-    verdict: Verdict
-    """Whether the model can be trusted."""
-
-
-def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrite: bool) -> Joined:
+def join(
+    run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrite: bool
+) -> tuple[Sequence[Alignment], Mapping[str, Any], Verdict]:
     """Join two runs of the same object in different postures into one run folder.
+
+    Returns alignments of their models, the likeliest, which was used, first; report and verdict.
 
     Args:
         run_a: run folder whose object frame is kept.
@@ -87,7 +79,7 @@ def join(run_a: Path, run_b: Path, out: Path, *, pairs: int, seed: int, overwrit
     )
     shown = [edge for edge in graph.edges if edge.source in second.views and edge.target in first.views]
     work = Work((first, second), graph, solve(graph, guess), shown, began_s)
-    return Joined(alignments, *write_run(out, work, meta, overwrite=overwrite))
+    return alignments, *write_run(out, work, meta, overwrite=overwrite)
 
 
 def sequences_of(run: Path, opened: Reopened, out: Path) -> list[str]:
@@ -245,20 +237,12 @@ def _step(view: RayImage, *, solution: Solution, views: Mapping[int, RayImage]) 
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Edited:
-    """Result of an edit."""
+def edit(
+    run: Path, dropped: Collection[int], out: Path, *, overwrite: bool
+) -> tuple[Mapping[str, Any], Verdict, tuple[int, ...]]:
+    """Optimise and fuse a run anew without some of its frames; return report, verdict, and which are left out, too.
 
-    report: Mapping[str, Any]
-    """As in report.json."""
-    verdict: Verdict
-    """Whether the model can be trusted."""
-    unconnected: tuple[int, ...]
-    """Frames that only those dropped joined to the others: they are left out, too."""
-
-
-def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> Edited:
-    """Optimise and fuse a run anew without some of its frames.
+    Those are the frames that only the dropped ones joined to the others.
 
     The camera keeps the focal length that the run found. Frames that are dropped are not in the new report, whose
     settings name them.
@@ -301,8 +285,8 @@ def edit(run: Path, dropped: Collection[int], out: Path, *, overwrite: bool) -> 
     sequence = " + ".join(sequences_of(run, before, out))
     meta = RunMeta(sequence, report["seed"], report["prior"], settings, report.get("camera"))
     same, work = out.resolve() == run.resolve(), Work((part,), graph, solution, edges, began_s)
-    found, verdict = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **_expected(before))
-    return Edited(found, verdict, unconnected)
+    done = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **_expected(before))
+    return *done, unconnected
 
 
 def _without(run: Reopened, frames: Collection[int]) -> Reopened:

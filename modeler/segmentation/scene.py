@@ -104,16 +104,15 @@ class Scene:
         return ()
 
 
-def scene_frames(indices: Sequence[int], before: Sequence[int] = (), *, count: int = 15) -> tuple[int, ...]:
-    """Return the numbers of frames, spread evenly over a sequence, from which to learn its scene.
+def scene_frames(indices: Sequence[int], before: Sequence[int] = ()) -> tuple[int, ...]:
+    """Return the numbers of 15 frames at most, spread evenly over a sequence, from which to learn its scene.
 
     Args:
         indices: numbers of all its frames.
         before: those from which it was learned before more frames came: they are kept, so that views of earlier frames
             stay the same, unless some are gone or they are less than half as many as there can be now.
-        count: how many at most.
     """
-    places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
+    places = np.linspace(0, len(indices) - 1, min(15, len(indices))).round()
     kept = 2 * len(before) >= len(places) and {*before} <= {*indices}
     return tuple(before) if kept else tuple(indices[place] for place in places.astype(np.int64).tolist())
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from modeler.sequences.survey import shaded_depth
 from modeler.system.pictures import encoded
 from modeler.types import BoolArray, Frame
 from modeler.viz.entities import OUTLINE_RGB
@@ -19,16 +20,8 @@ THUMBNAIL_PX: Final = 80  # height of a small picture
 
 
 def picture(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Return a frame as a picture (h, w, 3): its colour, else its depth, near bright."""
-    if frame.colour is not None:
-        return frame.colour
-    measured = frame.depth_m > 0.0  # False for NaN
-    if not measured.any():
-        return np.zeros((*frame.depth_m.shape, 3), dtype=np.uint8)
-    near, far = np.percentile(frame.depth_m[measured], (1, 99))
-    depth = np.where(measured, frame.depth_m, far)
-    grey = 235.0 - 190.0 * np.clip((depth - near) / max(far - near, 1e-6), 0.0, 1.0)
-    return np.repeat(np.where(measured, grey, 20.0).astype(np.uint8)[..., None], 3, axis=2)
+    """Return a frame as a picture (h, w, 3): its colour, else its depth."""
+    return shaded_depth(frame) if frame.colour is None else frame.colour
 
 
 def jpeg(frame: Frame) -> bytes:

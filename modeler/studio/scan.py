@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from modeler.composition import compose
 from modeler.composition.options import PriorOptions
@@ -438,8 +438,6 @@ def page_job(run: Path) -> Job:
 
 def drawn(shape: tuple[int, ...], points: Sequence[tuple[float, float]], radius_px: float) -> BoolArray:
     """Return the pixels (h, w) that a round brush covers along points (x, y) in px."""
-    from PIL import ImageDraw
-
     picture = Image.new("L", (shape[1], shape[0]))
     draw, width = ImageDraw.Draw(picture), max(1, round(2.0 * radius_px))
     if len(points) > 1:

@@ -330,7 +330,7 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
         folder = _run(studio, name, run)
         if folder is None or file not in _OF_RUN:
             return Response(status_code=404)
-        return _file(folder / file, {})
+        return _file(folder / file)
 
     @app.get("/viewer/{name}")
     @app.get("/viewer/")
@@ -343,7 +343,7 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
         folder = next((folder for folder in studio.folders() if folder.name == name), None)
         entries = {} if folder is None else {path.name: path for path in (folder / "take-away").glob("*")}
         if file in entries and entries[file].is_file():
-            return _file(entries[file], {}, download=file)
+            return _file(entries[file], download=file)
         whole = entries.get(file.removesuffix(".zip"))
         if whole is None or not whole.is_dir():
             return Response(status_code=404)
@@ -368,13 +368,13 @@ def _run(studio: Studio, name: str, run: str) -> Path | None:
     return found if found is not None and RunFolder(found).is_run else None
 
 
-def _file(path: Path, headers: dict[str, str], download: str | None = None) -> Response:
+def _file(path: Path, download: str | None = None) -> Response:
     """Send a regular file."""
     try:
         check_regular(path)
     except InputError:
         return Response(status_code=404)
-    return FileResponse(path, headers={"cache-control": "no-store", **headers}, filename=download)
+    return FileResponse(path, headers={"cache-control": "no-store"}, filename=download)
 
 
 def _picture(content: bytes) -> Response:

@@ -11,6 +11,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.closure import Closer, MapView
+from modeler.graph.focal import LIMIT_STEPS
 from modeler.priors import turntable_in
 from modeler.priors.mixtures import Gaussian
 from modeler.registration import VisibilityLikelihood
@@ -38,7 +39,6 @@ _POINTS: Final = 1500  # of a view, used to evaluate its surface
 _BIN_RAD: Final = np.radians(15.0)  # half of a turn that changes visibility much
 _JOINED: Final = 0.85  # 17 of 20 recordings with a turned-over object gave one right model (docs/method/suggestion.md)
 _LEAST_MASS: Final = 0.03  # of a bin of turns that is evaluated
-_SPAN_STEPS: Final = 4  # number of steps whose prior limits apply to closures
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,7 +417,7 @@ class Belief:
             return Gaussian(target_from_new, np.diag(np.repeat(candidate.sigmas, 3)) ** 2, source.centroid_m)
         prior = self.prior
         if target.index != self.last.index:  # a closure, whose motion the graph predicts: only limits count
-            prior = prior.relaxed(_SPAN_STEPS)
+            prior = prior.relaxed(LIMIT_STEPS)
         elif candidate.poke is not None:
             prior = candidate.poke_prior
         try:

@@ -10,7 +10,7 @@ import numpy as np
 from modeler import se3
 from modeler.priors import Poke, PokePrior
 from modeler.priors.mixtures import across_axis
-from modeler.priors.poke import pushed
+from modeler.priors.poke import STEPS, pushed
 from modeler.suggestion.surface_cells import Stand
 from modeler.types import Array, Plane, RayImage
 
@@ -93,7 +93,7 @@ def poked(poke: Poke, last: RayImage, plane: Plane) -> Array:
     axes = across_axis(plane.normal)
     seen = last.points_m @ axes.T
     way = axes @ np.array(poke.direction)
-    step = poke.length_m / 20.0 * way / np.linalg.norm(way)  # as many steps as `pushed` takes
+    step = poke.length_m / STEPS * way / np.linalg.norm(way)
     radius_m = np.sqrt(np.sum(np.var(seen, axis=0)))
     contact = axes @ np.array(poke.point_m) - seen.mean(axis=0)
     turn, shift = pushed(contact[None], step[None], np.array([radius_m]))

@@ -29,10 +29,6 @@ from modeler.sequences.input_files import check_link, entries, input_errors, rea
 from modeler.system.regular_files import MAX_BYTES, PIECE_BYTES, open_regular
 from modeler.types import InputError
 
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
-
-
 _STEP = 1_000_000  # instructions of the database between two looks at their number
 _STEPS = 100  # for one message of a small file: some seconds
 _STEPS_PER_BYTE = 1e-4  # and more in large ones: a row of ten bytes or more takes fewer than a thousand instructions

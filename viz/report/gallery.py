@@ -6,12 +6,12 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any, Final
 
 from modeler.export import write_atomically
+from modeler.viz.report.page import asset
 
 _SHOWN: Final = {
     "name": ("name", 1.0, ""),
@@ -60,7 +60,7 @@ def write_gallery(
     ]
     coded = [base64.b64encode(pictures.get(row["name"], b"")).decode() for row in rows]
     columns = [{"words": words, "unit": unit} for words, _, unit in _SHOWN.values()]
-    page = Template((resources.files("modeler.viz.report") / "gallery.html").read_text(encoding="utf-8")).substitute(
+    page = Template(asset("gallery.html")).substitute(
         title=escape(title), columns=_script(columns), models=_script(models), pictures=_script(coded)
     )
     write_atomically(out, page)

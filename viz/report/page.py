@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -57,10 +57,12 @@ def write_page(run: Path, out: Path, truth: Mapping[int, Array] | None = None) -
     parts += [*_closure(result, rows), *_accuracy(result, centre_m), *mask_cards(result, pictures)]
     parts += pair_cards(result, pictures, centre_m)
     parts.append(_settings(result))
-    page = Template(asset("page.html")).substitute(
-        title=escape(f"{_name(result)}: model report"), body="\n".join(parts)
-    )
-    write_atomically(out, page)
+    save_page(out, escape(f"{_name(result)}: model report"), parts)
+
+
+def save_page(out: Path, title: str, parts: Sequence[str]) -> None:
+    """Write a page of a title and parts in HTML."""
+    write_atomically(out, Template(asset("page.html")).substitute(title=title, body="\n".join(parts)))
 
 
 def _loop_closure_error(loop: Mapping[str, float] | None) -> list[tuple[str, str, str]]:
@@ -125,12 +127,17 @@ def _head(result: Result, mesh: Mesh | None) -> str:
             "to the truth together, as by <code>modeler evaluate</code>"
         )
         figures.append((f"{off.max_rotation_deg:.2f}°", "largest rotation error", why))
-    cells = "".join(f"<div><b>{value}</b>{words}<p class='quiet'>{why}</p></div>" for value, words, why in figures)
     where = escape(str(report["sequence"]))
     return (
         f"<h1>{escape(_name(result))}</h1><p class='quiet'>{where}, prior {escape(report['prior'])}, seed "
-        f"{report['seed']}</p>{verdict}<div class='figures'>{cells}</div>"
+        f"{report['seed']}</p>{verdict}{key_figures(figures)}"
     )
+
+
+def key_figures(figures: Iterable[tuple[str, str, str]]) -> str:
+    """Return values in HTML, each with its name and what it means."""
+    cells = "".join(f"<div><b>{value}</b>{words}<p class='quiet'>{why}</p></div>" for value, words, why in figures)
+    return f"<div class='figures'>{cells}</div>"
 
 
 def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
@@ -344,107 +351,83 @@ def _axis_words(direction: Array, up: Array) -> str:
     return "level axes" if tilt_deg > 85.0 else f"axes {tilt_deg:.0f}° off the vertical"
 
 
-@dataclass(frozen=True)
-class Check:
-    """Description of a value of the evidence."""
-
-    words: str
-    """Its name."""
-    why: str
-    """Meaning of a value beyond its limit."""
-    factor: float = 1.0
-    """To its unit."""
-    unit: str = ""
-    """As written behind the number."""
-
-
-CHECKS: Final = {
-    "unsure_masks": Check(
+CHECKS: Final = {  # name of a value, meaning of one beyond its limit, unit as written behind the number
+    "unsure_masks": (
         "frames with an unsure mask",
         "The object could not be segmented reliably. If this is the rule, anything may have been modelled.",
-        100.0,
         " %",
     ),
-    "motion_m": Check(
+    "motion_m": (
         "largest motion of the surface",
         "From the first frame to any other. If it does not exceed the sensor's noise, the object did not turn.",
-        1000.0,
         " mm",
     ),
-    "prior_sds": Check(
+    "prior_sds": (
         "largest distance of a pair from the prior",
         "The prior describes the motion before the images are compared. Many standard deviations (sd) from it are a "
         "contradiction.",
-        1.0,
         " sd",
     ),
-    "prior_chi2": Check(
+    "prior_chi2": (
         "mean squared distance of all pairs from the prior",
         "In units of the prior's variance. The mean reveals many small deviations to one side, such as from a wrong "
         "step.",
+        "",
     ),
-    "loop_sigmas": Check(
+    "loop_sigmas": (
         "largest loop closure error, before optimisation",
         "By how much the chain of consecutive pairs misses an earlier view, in sd of its covariances; 1 is expected. "
         "More: a wrong pair, or errors common to all pairs, such as from a wrong focal length.",
-        1.0,
         " sd",
     ),
-    "graph_chi2": Check(
+    "graph_chi2": (
         "mean squared residual of the edges",
         "Distance of the registrations from the optimised poses, in units of their variance; 1 is expected.",
+        "",
     ),
-    "free_space_violations": Check(
+    "free_space_violations": (
         "free-space violations: surface of a frame in the free space of others",
         "Another frame measured something behind it, although it should occlude that: one of the two poses is wrong.",
-        100.0,
         " %",
     ),
-    "false_surface": Check(
+    "false_surface": (
         "false surface: surface of a frame contradicted by others",
         "It lies in the free space of most frames that observe it: the pose of this frame is wrong, or its mask "
         "includes more than the object.",
-        100.0,
         " %",
     ),
-    "colour_fit": Check(
+    "colour_fit": (
         "agreement of colours on surface that two frames see",
         "Correlation of the print, as a share of the best one with colour shifted, scaled, mirrored or of another "
         "frame. Less: colour is not aligned to depth.",
-        100.0,
         " %",
     ),
-    "print_fit": Check(
+    "print_fit": (
         "agreement of print between frames that match",
         "Least correlation of two frames that no chain of agreeing ones joins, as a share of that of others. Less: "
         "they show different sides.",
-        100.0,
         " %",
     ),
-    "flat_frames": Check(
+    "flat_frames": (
         "frames that match the others by one flat face",
         "Another side of a box matches as well, and neither print nor the given motion excludes it.",
+        "",
     ),
-    "pose_sd_deg": Check(
-        "largest sd of a pose's rotation", "At the limit, one pose in twenty is off by more than 3°.", 1.0, "°"
-    ),
-    "pose_sd_m": Check(
+    "pose_sd_deg": ("largest sd of a pose's rotation", "At the limit, one pose in twenty is off by more than 3°.", "°"),
+    "pose_sd_m": (
         "largest sd of a pose's position",
         "At the limit, one pose in twenty displaces the surface by more than the tolerance.",
-        1000.0,
         " mm",
     ),
-    "size_m": Check(
+    "size_m": (
         "surface error due to unknown scale",
         "Loops cannot distinguish a wrong focal length from too flat a depth relief, and sizes depend on which it is.",
-        1000.0,
         " mm",
     ),
-    "other_modes": Check(
+    "other_modes": (
         "probability of another mode",
         "If several poses explain a pair of images, as for symmetric objects, each is a mode. This is the probability "
         "that some pair is at another mode than the model assumes.",
-        100.0,
         " %",
     ),
 }
@@ -452,21 +435,22 @@ CHECKS: Final = {
 
 def evidence_table(evidence: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the values with their limits as HTML; "" for runs of earlier versions."""
-    rows = [_row(CHECKS.get(name, Check(name.replace("_", " "), "")), figure) for name, figure in evidence.items()]
+    rows = [_row(CHECKS.get(name, (name.replace("_", " "), "", "")), figure) for name, figure in evidence.items()]
     if not rows:
         return ""
     return f"<h2>Checks</h2><table class='evidence'>{''.join(rows)}</table>"
 
 
-def _row(check: Check, figure: Mapping[str, Any]) -> str:
+def _row(check: tuple[str, str, str], figure: Mapping[str, Any]) -> str:
     """Return a figure as a row of a table."""
+    words, why, unit = check
+    factor = {" %": 100.0, " mm": 1000.0}.get(unit, 1.0)
     value, limit = (
-        "unknown" if number is None else f"{check.factor * number:.3g}{check.unit}"
-        for number in (figure["value"], figure["limit"])
+        "unknown" if number is None else f"{factor * number:.3g}{unit}" for number in (figure["value"], figure["limit"])
     )
     bound = "at least" if figure.get("at_least") else "at most"
     mark = "holds" if figure["holds"] else "<b class='no'>does not hold</b>"
     return (
-        f"<tr><th>{escape(check.words)}<p class='quiet'>{escape(check.why)}</p></th><td>{value}</td>"
+        f"<tr><th>{escape(words)}<p class='quiet'>{escape(why)}</p></th><td>{value}</td>"
         f"<td class='quiet'>{bound} {limit}</td><td>{mark}</td></tr>"
     )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler import evaluation, se3
 from modeler.export.placing import ring_axes
@@ -18,12 +20,6 @@ from modeler.viz.report.run_data import Result
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-from collections.abc import Sequence
-from dataclasses import dataclass
-
-import numpy.typing as npt
 
 AFTER: Final = "#3b6fb6"
 BEFORE: Final = "#8a6bb8"

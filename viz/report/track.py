@@ -7,16 +7,14 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from statistics import median
-from string import Template
 from typing import Any
 
 import numpy as np
 
 from modeler import se3
-from modeler.export import write_atomically
 from modeler.types import Array
 from modeler.viz.report.cards import outlined_card, outlined_cards, size_px, with_outline
-from modeler.viz.report.page import asset
+from modeler.viz.report.page import key_figures, save_page
 from modeler.viz.report.run_data import recorded
 
 
@@ -42,8 +40,7 @@ def write_track_page(folder: Path, out: Path, centre_m: Array) -> None:
     name = escape(f"{Path(track['model']).name} in {Path(track['sequence']).name}")
     parts = [f"<h1>{name}</h1>", _verdict(poses), _figures(poses), *outlined_cards("Frames", note, cards)]
     parts.append(_table(poses, centre_m))
-    page = Template(asset("page.html")).substitute(title=f"{name}: tracking report", body="\n".join(parts))
-    write_atomically(out, page)
+    save_page(out, f"{name}: tracking report", parts)
 
 
 def _doubts(pose: Mapping[str, Any]) -> list[str]:
@@ -71,8 +68,7 @@ def _figures(poses: Sequence[Mapping[str, Any]]) -> str:
         (str(absent), "frames without the object", "no pose of the model explains them"),
         (f"{median([pose['seconds'] for pose in poses] or [0.0]):.2f} s", "a frame", "median, finding and following"),
     )
-    cells = "".join(f"<div><b>{value}</b>{words}<p class='quiet'>{why}</p></div>" for value, words, why in figures)
-    return f"<div class='figures'>{cells}</div>"
+    return key_figures(figures)
 
 
 def _table(poses: Sequence[Mapping[str, Any]], centre_m: Array) -> str:
