@@ -260,7 +260,8 @@ def run(job: Job) -> Ended | None:
             left.unlink(missing_ok=True)
         log.truncate(0)
         command = [sys.executable, "-m", BUILDER, json.dumps(asdict(job))]
-        status = PROCESSES.run(command, _environment(job.threads), log.fileno())
+        threads = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), str(job.threads))
+        status = PROCESSES.run(command, environment() | threads, log.fileno())
         if status is None:
             return None
         note = read_note(job.note)
@@ -295,9 +296,3 @@ def last_line(log: Path, status: int) -> str:
     lines = log.read_text(errors="replace").splitlines()
     said = next((line for line in reversed(lines) if line.startswith(_LINE)), "")
     return said.removeprefix(_LINE) or f"ended with status {status} and no message; see {log}"
-
-
-def _environment(threads: int) -> dict[str, str]:
-    """Return the environment of a process that builds, with as many threads as it may have."""
-    counts = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), str(threads))
-    return environment() | counts

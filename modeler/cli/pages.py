@@ -131,8 +131,10 @@ class Gallery:
             for row in progress.track(rows):
                 name = row["name"]
                 if row.get("triangles"):
-                    picture = self.folder / NOTES / f"{name}.jpg"
-                    if not _newer(picture, self.folder / name / "model.ply"):
+                    picture, model = self.folder / NOTES / f"{name}.jpg", self.folder / name / "model.ply"
+                    if not picture.exists() or (
+                        model.exists() and picture.stat().st_mtime_ns < model.stat().st_mtime_ns
+                    ):
                         thumbnail_of(self.folder / name, picture)
                     if picture.exists():  # not so where the model was removed
                         pictures[name] = read_regular(picture)
@@ -143,11 +145,6 @@ class Gallery:
         write_gallery(out, self.folder.absolute().name, [blank() | row for row in rows], pictures, links)
         say(f"open {out} in a browser")
         return 0
-
-
-def _newer(picture: Path, model: Path) -> bool:
-    """Return whether the picture of a model is up to date, or the model was removed."""
-    return picture.exists() and (not model.exists() or picture.stat().st_mtime_ns >= model.stat().st_mtime_ns)
 
 
 @dataclass(frozen=True)

@@ -103,9 +103,6 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(held)  # which a killed program does, too
 
 
-_TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
-
-
 def pose_text(pose: Array) -> str:
     """Return `tx ty tz qx qy qz qw` of a pose (4, 4), in m, with every digit that it has and qw not negative."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
@@ -138,21 +135,16 @@ def g2o_text(edges: Sequence[Edge], solution: Solution) -> str:
     lines = [
         f"VERTEX_SE3:QUAT {frame} {pose_text(solution.trajectory[frame])}" for frame in sorted(solution.trajectory)
     ]
+    order = [3, 4, 5, 0, 1, 2]  # translation first
     for edge in edges:
         solved = edge.target in solution.trajectory and edge.source in solution.trajectory
         if solved and solution.takes_part(edge):
             pose = solution.pose_of(edge)
             covariance = pose.covariance if solution.focal is None else pose.widened(solution.focal.sigma).covariance
-            numbers = " ".join(repr(float(value)) for value in _upper_triangle(covariance))
+            whitening = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(order, order)]))
+            numbers = " ".join(map(repr, (whitening.T @ whitening)[np.triu_indices(6)].tolist()))
             lines.append(f"EDGE_SE3:QUAT {edge.target} {edge.source} {pose_text(pose.mean)} {numbers}")
     return "".join(f"{line}\n" for line in lines)
-
-
-def _upper_triangle(covariance: Array) -> Array:
-    """Return the upper triangle (21,), row by row, of the information (6, 6) that belongs to a covariance (6, 6)."""
-    permuted = covariance[np.ix_(_TRANSLATION_FIRST, _TRANSLATION_FIRST)]
-    whitening = np.linalg.inv(np.linalg.cholesky(permuted))
-    return (whitening.T @ whitening)[np.triu_indices(6)]
 
 
 def cloud_ply(model: ObjectModel) -> bytes:

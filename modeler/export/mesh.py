@@ -109,7 +109,8 @@ def write_mesh(
             if texture is not None:
                 _, _, material, image = files_of(out, textured=True)
                 write_atomically(image, encoded(texture.image, "PNG"))
-                write_atomically(material, _material(image.name))
+                shown = f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image.name}\n"
+                write_atomically(material, shown)
             write_atomically(out, _obj(model, "_".join(out.stem.split()), texture, f"{unit}, {axes}"))
         case ".3mf":
             write_atomically(out, _3mf(model, unit))
@@ -117,11 +118,6 @@ def write_mesh(
             write_atomically(out, _glb(model, texture, object_from_upright))
         case _:
             write_atomically(out, _stl(model, unit))
-
-
-def _material(image: str) -> str:
-    """Return an MTL file with one material, `surface`, that shows an image and nothing else."""
-    return f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {image}\n"
 
 
 def _obj(model: ObjectModel, name: str, texture: Texture | None, header: str) -> str:

@@ -131,7 +131,9 @@ def placement(model: ObjectModel, report: Mapping[str, Any], origin: Origin, up:
         case "camera":
             pass
         case "centre":
-            object_from_mesh[:3, 3] = _centroid(model)
+            middles_m = model.vertices_m[model.triangles].mean(axis=1)
+            areas = areas_m2(model.vertices_m, model.triangles)
+            object_from_mesh[:3, 3] = np.average(middles_m, axis=0, weights=areas)
         case "bbox":
             turn = object_from_mesh[:3, :3]
             object_from_mesh[:3, 3] = turn @ _box_centre(model.vertices_m @ turn)
@@ -150,12 +152,6 @@ def placement(model: ObjectModel, report: Mapping[str, Any], origin: Origin, up:
 def _box_centre(points: Array) -> Array:
     """Return the centre (3,) of the box around points (n, 3)."""
     return 0.5 * (points.min(axis=0) + points.max(axis=0))
-
-
-def _centroid(model: ObjectModel) -> Array:
-    """Return the centroid (3,) of the surface of a mesh."""
-    middles_m = model.vertices_m[model.triangles].mean(axis=1)
-    return np.average(middles_m, axis=0, weights=areas_m2(model.vertices_m, model.triangles))
 
 
 _LEAST_BACK = 0.3  # least horizontal part of the direction to the camera: else it looks straight down

@@ -159,17 +159,12 @@ def _impossible(record: Mapping[str, Any]) -> str | None:
         return None
     for part in (record, *(record.get("modes") or ())):
         for name in ("target_from_source", "object_from_camera"):
-            if name in part and not _rigid(part[name]):
+            if name in part and not se3.is_rigid(np.array(part[name], np.float64).reshape(4, 4), tolerance=_ROUND):
                 return repr(name)
         for name in ("covariance", "covariance_given_camera"):
             if part.get(name) and not _definite(part[name], 0.0 if "accepted" in record else -_ROUND):
                 return repr(name)
     return None
-
-
-def _rigid(numbers: list[float | None]) -> bool:
-    pose = np.array(numbers, dtype=np.float64).reshape(4, 4)
-    return se3.is_rigid(pose, tolerance=_ROUND)
 
 
 def _definite(numbers: list[float | None], least: float) -> bool:

@@ -18,7 +18,6 @@ from modeler.types import (
     Edge,
     FrameRecord,
     OptimisationOutlier,
-    Plane,
     PoseGaussian,
     Posterior,
     RayImage,
@@ -81,7 +80,8 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
     if step.view is not None:  # also where the frame was left out
         views[step.frame.index] = step.view
     verdict = step.verdict or judged(step)
-    support = _support(solution, views)
+    first = views.get(min(solution.trajectory, default=-1))  # whose camera frame is the object's
+    support = None if first is None else first.plane
     report = {
         "schema": _SCHEMA,
         "sequence": meta.sequence,
@@ -162,12 +162,6 @@ def _loop(
         "opening_m": error.translation_m,
         "sigmas": error.sigmas,
     }
-
-
-def _support(solution: Solution, views: Mapping[int, RayImage]) -> Plane | None:
-    """Return the support plane in the first frame, whose camera frame is the object's; None if not seen."""
-    first = views.get(min(solution.trajectory, default=-1))
-    return None if first is None else first.plane
 
 
 def edge_record(

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 from scipy.spatial import KDTree
 
 from modeler.fusion import meshing
-from modeler.fusion.depth_views import DepthViews, ViewBlocks
+from modeler.fusion.depth_views import ViewBlocks
 from modeler.fusion.meshing import FAINT, DistanceField
 from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
@@ -99,16 +97,11 @@ def support_planes(seen: ViewBlocks, corners_m: Array, tau_m: float) -> Array:
         alike = np.abs(heights_m[:, remaining] - heights_m[:, remaining[:1]]).max(axis=0) < tau_m
         plane = np.median(planes[remaining[alike]], axis=0)
         plane /= np.linalg.norm(plane[:3])
-        below = float(np.mean(seen.thinned(partial(_heights_m, plane)) < -tau_m))
+        below = float(np.mean(seen.thinned(lambda views, plane=plane: views.points_m @ plane[:3] + plane[3]) < -tau_m))
         if np.count_nonzero(alike) > OUTVOTED * seen.count and below < BELOW_PLANE:
             found.append(plane)
         remaining = remaining[~alike]
     return np.reshape(found, (-1, 4))
-
-
-def _heights_m(plane: Array, views: DepthViews) -> Array:
-    """Return the heights (n,) of all surface points above a plane (4,)."""
-    return views.points_m @ plane[:3] + plane[3]
 
 
 def cleaned(

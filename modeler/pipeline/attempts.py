@@ -101,9 +101,9 @@ class Search:
                     continue
                 attempt = Attempt(self.view, target, prior, prefer=rung.prefer)
                 if self.least_effort < FULL and self._probably_hidden:
-                    yield replace(attempt, effort=self.least_effort, prefer=_earlier)
-                    if not _promising(self.made[-1]):
-                        continue
+                    yield replace(attempt, effort=self.least_effort, prefer=lambda search, earlier, newer: earlier)
+                    if not self.made[-1].matches or self.made[-1].outcome is Outcome.AT_LIMIT:
+                        continue  # nor would it place the frame with full effort
                 yield attempt
 
     def add(self, attempt: Attempt, posterior: Posterior) -> None:
@@ -173,11 +173,6 @@ def told_otherwise(prior: AbstractPrior, source: RayImage, target: RayImage, ste
         density = prior.relaxed(max(steps, 2)).between(source, target)
         return distance_nats(density, float(density.log_prior(motions).max())) > TAIL_NATS
     return False
-
-
-def _promising(posterior: Posterior) -> bool:
-    """Return whether a registration of full effort may place a frame after one of little effort."""
-    return posterior.matches and posterior.outcome is not Outcome.AT_LIMIT
 
 
 # Views to register a view against.
@@ -278,10 +273,6 @@ def predicted(
 # Conditions on what was found so far.
 
 
-def _always(search: Search) -> bool:
-    return True
-
-
 def _at_the_limits(search: Search) -> bool:
     """Return whether the motion may exceed the limits of one step."""
     return search.steps == 1 and search.found[search.first].outcome in _LIMIT_OUTCOMES
@@ -296,10 +287,6 @@ def _unconvincing(search: Search) -> bool:
 
 def _newest(search: Search, earlier: Posterior, newer: Posterior) -> Posterior:
     return newer
-
-
-def _earlier(search: Search, earlier: Posterior, newer: Posterior) -> Posterior:
-    return earlier
 
 
 def _if_converged(search: Search, earlier: Posterior, newer: Posterior) -> Posterior:
@@ -370,7 +357,7 @@ class Rung:
     """The views of the graph to register the view against."""
     prior: Callable[[Search, int], AbstractPrior | None]
     """Prior of the motion to one of them; None: it is not tried."""
-    condition: Callable[[Search], bool] = _always
+    condition: Callable[[Search], bool] = lambda search: True
     """On the registrations so far."""
     prefer: Prefer = _newest
     """Which of two registrations of a pair counts."""

@@ -122,7 +122,15 @@ class Joiner:
             found = self._refined(target, source, propose(target, source), found)
             if found and found[0].accepted >= MIN_JOINS and self.is_consistent(target, source, found[0]):
                 return found
-        return [replace(found[0], edges=tuple(map(_rejected, found[0].edges))), *found[1:]] if found else []
+        if not found:
+            return []
+        edges = tuple(  # the segments contradict each other
+            replace(edge, accepted=False, reason=Failed(Outcome.NO_OVERLAP, edge.posterior.overlap))
+            if edge.accepted
+            else edge
+            for edge in found[0].edges
+        )
+        return [replace(found[0], edges=edges), *found[1:]]
 
     def is_consistent(self, target: Segment, source: Segment, alignment: Alignment) -> bool:
         """Return whether views of two segments fit each other as well as those of one segment that share as much do.
@@ -388,12 +396,3 @@ def rejected_elsewhere(edge: Edge, solution: Solution) -> Edge:
     motion = se3.inverse(edge.posterior.pose.mean) @ solution.relative(edge.target, edge.source)
     reason = ElsewhereThanSegments(float(np.degrees(se3.rotation_angle(motion))))
     return replace(edge, accepted=False, reason=reason)
-
-
-def _rejected(edge: Edge) -> Edge:
-    """Return an edge, rejected because the segments contradict each other."""
-    return (
-        replace(edge, accepted=False, reason=Failed(Outcome.NO_OVERLAP, edge.posterior.overlap))
-        if edge.accepted
-        else edge
-    )

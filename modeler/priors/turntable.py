@@ -381,7 +381,7 @@ class TurntablePrior(AbstractPrior):
     def _limits(self, source: RayImage, target: RayImage) -> AbstractPoseDensity:
         """Return the uniform density within reach of the steps, on the table if one is seen."""
         steps = target.index - source.index
-        turn_deg = _on_circle(steps * self.step_deg)
+        turn_deg = (steps * self.step_deg + 180.0) % 360.0 - 180.0
         half_width_deg = reach_deg(float(self.step_sigma_deg * np.sqrt(abs(steps))))
         limit_deg = min(abs(turn_deg) + half_width_deg, 180.0)
         if support(source, target) is None:
@@ -392,11 +392,6 @@ class TurntablePrior(AbstractPrior):
         return replace(
             density, max_rotation_rad=float(np.radians(half_width_deg)), middle_rad=float(np.radians(turn_deg))
         )
-
-
-def _on_circle(turn_deg: float) -> float:
-    """Return a turn wrapped to -180 to 180 degrees."""
-    return (turn_deg + 180.0) % 360.0 - 180.0
 
 
 def turntable_in(prior: AbstractPrior) -> TurntablePrior | None:

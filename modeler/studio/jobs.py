@@ -203,17 +203,15 @@ class Queue:
         elif not ended:
             return False
         jobs = [*([] if self.current is None else [self.current]), *self.waiting]
-        write_atomically(self.file, json.dumps([_record(job) for job in jobs]) + "\n")
+        names = ("words", "title", "pid", "frames")
+        kept = [{"log": str(job.log), **{name: getattr(job, name) for name in names}} for job in jobs]
+        write_atomically(self.file, json.dumps(kept) + "\n")
         return ended
 
     def stop(self) -> None:
         """Ask the running job to end."""
         if self.current is not None:
             self.current.stop()
-
-
-def _record(job: Job) -> dict[str, Any]:
-    return {"words": job.words, "log": str(job.log), "title": job.title, "pid": job.pid, "frames": job.frames}
 
 
 def _read(record: dict[str, Any]) -> Job:

@@ -196,7 +196,8 @@ class Viewers:
     def address(self, scan: Scan | None) -> str:
         """Return the address of the viewer with the build that runs, else with the latest run of a scan."""
         source = self._started().sink
-        if scan is not None and scan.run is not None and self.live != str(scan.run) and not self._awaited:
+        awaited = self.live and not Path(self.live).exists()  # of a build that has not made its folder yet
+        if scan is not None and scan.run is not None and self.live != str(scan.run) and not awaited:
             run = scan.run.name
             source = f"{self.server}/runs/{quote(scan.name)}/{quote(run)}/recording.rrd?token={self.token}"
         return f"/viewer/?url={quote(source, safe='')}&renderer=webgl"
@@ -221,11 +222,6 @@ class Viewers:
         if self._viewer is not None:
             self._viewer.stop()
         self._viewer, self.live = None, ""
-
-    @property
-    def _awaited(self) -> bool:
-        """Whether the build that it shows has not made its folder yet."""
-        return bool(self.live) and not Path(self.live).exists()
 
     def _started(self) -> Viewer:
         if self._viewer is None or self._viewer.process.poll() is not None:

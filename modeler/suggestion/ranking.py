@@ -12,7 +12,7 @@ from modeler.priors import turntable_in
 from modeler.suggestion.belief import Belief, Prediction
 from modeler.suggestion.candidates import Candidate, pokes, turns
 
-_COARSE_DEG, _FINE_DEG = 10.0, 5.0  # between compared turns: turning by hand is not more precise
+_COARSE_DEG = 10.0  # between compared turns; between the last ones half of it, as turning by hand is not more precise
 _LYING_COST = 8.0  # a separate run: a full turn in steps of 45° at least
 _ALIKE = 0.9  # of the better gain: a turn is then equally good either way
 
@@ -134,7 +134,7 @@ def _default(belief: Belief) -> list[Prediction]:
         Candidate("turn", turn_deg=best.candidate.turn_deg + offset_deg)
         for sign in (1.0, -1.0)
         for best in sorted((f for f in found if f.candidate.turn_deg * sign > 0.0), key=lambda f: -f.worth_nats)[:1]
-        for offset_deg in (-_FINE_DEG, _FINE_DEG)
+        for offset_deg in (-0.5 * _COARSE_DEG, 0.5 * _COARSE_DEG)
     ]
     return others + found + _predicted(belief, fine)
 
@@ -145,16 +145,14 @@ def _in_words(belief: Belief, found: Sequence[Prediction]) -> list[tuple[Predict
     for place, each in enumerate(found):
         if id(each) in passed:
             continue
-        other = next((f for f in found[place:] if _mirrored(f.candidate, each.candidate)), None)
+        mirrored = -each.candidate.turn_deg if each.candidate.action == "turn" else None
+        others = (one for one in found[place:] if (one.candidate.action, one.candidate.turn_deg) == ("turn", mirrored))
+        other = next(others, None)
         either = other is not None and other.worth_nats >= _ALIKE * each.worth_nats > 0.0
         if either:
             passed.add(id(other))
         worded.append((each, f"{_action(each.candidate, either=either)}: {_effect(belief, each)}"))
     return worded
-
-
-def _mirrored(one: Candidate, other: Candidate) -> bool:
-    return one.action == other.action == "turn" and one.turn_deg == -other.turn_deg
 
 
 def _action(candidate: Candidate, *, either: bool) -> str:

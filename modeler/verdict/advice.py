@@ -229,7 +229,9 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
         report: of the run.
         prior: of the run.
     """
-    codes = sorted(report.get("reason_codes") or (), key=_urgency)
+    # Wrong colours may cause others, lost frames follow them.
+    urgency = {"colour_misaligned": 0, "left_out": 2}
+    codes = sorted(report.get("reason_codes") or (), key=lambda code: urgency.get(code, 1))
     by_code: dict[str, Callable[[Mapping[str, Any], AbstractPrior], Remedy | None]] = {
         "left_out": _at_limit,
         "colour_misaligned": _without_colour,
@@ -247,11 +249,6 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
     first = [(code, each) for code, each in found if each is not None][:1]
     size = [_known_camera(report, prior)] if "unsure_size" in codes and first and first[0][0] != "unsure_size" else []
     return [each for _, each in first] + size
-
-
-def _urgency(code: str) -> int:
-    """Return the place of a reason among those to act upon: wrong colours may cause others, lost frames follow them."""
-    return {"colour_misaligned": 0, "left_out": 2}.get(code, 1)
 
 
 def _without_colour(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:

@@ -180,13 +180,6 @@ def _surface(view: RayImage) -> BoolArray:
     return np.asarray(ndimage.binary_closing(surface), dtype=np.bool_)
 
 
-def _outline(view: RayImage) -> Array:
-    """Return columns and rows (n, 2) of the outline of a view's surface."""
-    surface = _surface(view)
-    inner = np.asarray(ndimage.binary_erosion(surface), dtype=np.bool_)
-    return np.argwhere(surface & ~inner)[:, ::-1].astype(np.float64)
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Colours of pairs of views, compared under displacements."""
@@ -281,7 +274,10 @@ class Comparison:
         for number, frame in enumerate(self._frames):
             place = order.index(frame) + displacement.frames
             if 0 <= place < len(order):
-                column, row = displacement.moved(_outline(self.views[order[place]]), self._steepness[number].shape).T
+                surface = _surface(self.views[order[place]])
+                inner = np.asarray(ndimage.binary_erosion(surface), dtype=np.bool_)
+                outline = np.argwhere(surface & ~inner)[:, ::-1].astype(np.float64)
+                column, row = displacement.moved(outline, self._steepness[number].shape).T
                 found.append(ndimage.map_coordinates(self._steepness[number], [row, column], order=1, mode="nearest"))
         return float(np.mean(np.concatenate(found)))
 

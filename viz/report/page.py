@@ -147,13 +147,14 @@ def _model(result: Result, mesh: Mesh | None) -> Sequence[str]:
     cameras = [_pyramid(pose.mean) for pose in result.poses.values()]
     object_from_upright = model_upright(result.report)
     data = json.dumps(scene(mesh, cameras, object_from_upright))
+    poster = data_address(portrait(mesh, object_from_upright, (460, 1048)), "jpeg")
     paints = {"colours": "colour", "certainty": "standard deviation", "plain": "plain"}
     known = [name for name in paints if name == "plain" or getattr(mesh, name) is not None]
     options = "".join(f"<option value='{name}'>{paints[name]}</option>" for name in known)
     made_coarser = "" if len(mesh.triangles) == mesh.total else f", shown with {len(mesh.triangles):,}"
     return [
         "<h2>Model</h2><figure><div class='stage'>"
-        f"<canvas id='mesh' style='background-image:url({_poster(mesh, object_from_upright)})'></canvas>"
+        f"<canvas id='mesh' style='background-image:url({poster})'></canvas>"
         f"<div class='switches'><span id='scale' hidden>sd {_scale()} {1000.0 * MOST_SIGMA_M:g} mm, "
         f"<span class='pink'>pink: not seen</span></span><select id='paint'>{options}</select>"
         "<label><input type='checkbox' id='cameras'> cameras</label></div></div>"
@@ -281,11 +282,6 @@ def _pyramid(object_from_camera: Array) -> Array:
     tip = np.zeros(3)
     outline = [tip, *corners, corners[0], tip, corners[1], corners[2], tip, corners[3]]
     return se3.transform(object_from_camera, np.array(outline))
-
-
-def _poster(mesh: Mesh, object_from_upright: Array) -> str:
-    """Return a still picture of the mesh as a data address."""
-    return data_address(portrait(mesh, object_from_upright, (460, 1048)), "jpeg")
 
 
 def _scale() -> str:
