@@ -272,11 +272,10 @@ def folded(vertices_m: Array, normals: Array, seen: BoolArray, added: BoolArray)
 
 
 def without_loose_border(marked: BoolArray, loose: BoolArray, triangles: Triangles) -> BoolArray:
-    """Return the marked vertices (v,) without loose ones that the border reaches over others."""
-    outside, before = ~marked, -1
+    """Return the marked vertices (v,) without loose ones that the border reaches over at most eight others."""
+    outside = ~marked
     triangles = triangles[np.any(loose[triangles], axis=1)]
-    while (count := np.count_nonzero(outside)) != before:
-        before = count
+    for _ in range(8):  # without an end, the capture cap loses four vertices more
         outside[triangles[np.any(outside[triangles], axis=1)]] = True
         outside &= ~marked | loose
     return ~outside

@@ -17,9 +17,7 @@ from scipy import ndimage
 from modeler.kernels import planes
 from modeler.segmentation.depth_images import without_specks
 from modeler.types import Array, BoolArray, Float32Array, Frame
-
-WIDENED_PX = 8
-"""Largest widening of an outline by depth cameras: a D415 with hole filling by up to 8 px of 640."""
+from modeler.views.range_noise import WIDENED_PX
 
 _LEAST_FRAMES = 3  # in which a pixel must show the background for a known colour
 _LEAST_SIGMA = 3.0  # of 255 levels: noise of a colour camera indoors

@@ -28,7 +28,6 @@ Labels = npt.NDArray[np.int32]
 _JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
 _GRID_CELLS = 80  # largest number of voxels along a side
 _GRAZING = np.tan(np.radians(85.0))  # surfaces at a more grazing angle are indistinguishable from mixed pixels
-_RAGGED_SHARE = 0.02  # share of the image by which the edge of a blind band may bend after undistortion
 _SPECK_SHARE = 0.003  # share of a mask; smaller pieces are removed
 
 
@@ -278,11 +277,11 @@ def _outermost(seen: BoolArray) -> BoolArray:
     edge = np.zeros_like(seen)
     rows = np.flatnonzero(seen.mean(axis=1) > MOST)
     if len(rows):
-        first, last, ragged = int(rows[0]), int(rows[-1]), round(_RAGGED_SHARE * len(seen))
+        first, last = int(rows[0]), int(rows[-1])
         beyond = np.pad(seen, ((1, 1), (0, 0)))
-        if _blind(seen[: max(first - ragged, 0)]):
+        if _blind(seen[:first]):
             edge[first] = ~beyond[first]
-        if _blind(seen[last + 1 + ragged :]):
+        if _blind(seen[last + 1 :]):
             edge[last] |= ~beyond[last + 2]
     edge[[0, -1]] = True
     return edge & seen

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from modeler.segmentation.depth_images import DepthNoise
+from modeler.segmentation.depth_images import MOSTLY, DepthNoise
 from modeler.types import Array, BoolArray, Float32Array, Plane
 
 Real = TypeVar("Real", bound=np.floating[Any])
@@ -20,9 +20,7 @@ _SYSTEMATIC_SHARE = 0.0015  # error of the plane's distance that its residuals d
 _MIN_POINTS = 50  # of a plane, and of the ground seen on it
 _TRIM = 3.0  # standard deviations
 _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
-_LEAST_BLOCKS = 6
 _CELL_PX = 5
-_CELL_SHARE = 0.7  # least share of measured pixels in a cell
 _MAX_HYPOTHESES = 200
 _MOST_PLANES = 10
 _UPRIGHT = 0.2  # least upward (-y) component of the normal of a plane that faces up
@@ -31,7 +29,6 @@ _LEVEL = np.cos(np.radians(2.0))
 _LEVEL_BONUS = 1.5  # factor on the votes for level planes
 _PARALLEL = np.cos(np.radians(6.0))  # between the normals of parallel planes, given the accuracy of small ones
 _ABOVE_SHARE = 0.98  # share of an object above its support
-_OVERHANG = 1.0  # of its size, at most, from the support to where it is seen: bodies that overhang 0.7, balls 0.3
 _TOUCHING_SHARE = 0.1  # share of an object's size: 0.04 to 0.06 are left above a support, 0.2 before a near wall
 _REACH_SIZES = 1.5  # radius of an object's surroundings, in sizes of the object
 _MAX_GROUND = 6000  # points; more do not help, since their errors are correlated
@@ -129,7 +126,7 @@ def _sandwich(uv: Array, residual: Array, weight: Array) -> Array:
         cell = np.minimum((uv - low) * (across / side), across - 1).astype(np.int64)
         block = cell[:, 0] * across + cell[:, 1]
         blocks = int(np.count_nonzero(np.bincount(block)))
-        if blocks < _LEAST_BLOCKS:
+        if blocks <= 3:  # as many as a plane has parameters
             continue
         sums = np.stack([np.bincount(block, score[:, k]) for k in range(3)])
         other = bread @ (sums @ sums.T) @ bread * (blocks / (blocks - 3))
@@ -244,7 +241,8 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
         height = heights(body, plane)
         seen = np.count_nonzero(np.abs(heights(ground, plane)) < np.median(tolerance))
         lowest, low = np.percentile(height, [1, 5])
-        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and low < _OVERHANG * size
+        # Bodies that overhang are seen from 0.7 of their size above the support, balls from 0.3.
+        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and low < size
         holds &= lowest < _TOUCHING_SHARE * size or plane[1] < _UPRIGHT
         merit = (int(grade), -float(np.median(height)))
         if seen >= _MIN_POINTS and holds and merit > best:
@@ -335,7 +333,7 @@ def _flat_cells(points: Float32Array, noise: DepthNoise) -> _Cells:
     block = points[: rows * _CELL_PX, : columns * _CELL_PX].reshape(rows, _CELL_PX, columns, _CELL_PX, 3)
     block = block.swapaxes(1, 2).reshape(rows * columns, _CELL_PX**2, 3)
     finite = np.isfinite(block[..., 2])
-    kept = finite.sum(axis=1) >= _CELL_SHARE * _CELL_PX**2
+    kept = finite.sum(axis=1) >= MOSTLY * _CELL_PX**2
     block, finite = block[kept].astype(np.float64), finite[kept]
     count = finite.sum(axis=1).astype(np.float64)
     block[~finite] = 0.0

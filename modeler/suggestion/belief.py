@@ -19,7 +19,7 @@ from modeler.registration.visibility.points import point_rows
 from modeler.suggestion.candidates import Candidate
 from modeler.suggestion.edge_prediction import TURNS_RAD, USUAL_NOISE, EdgePredictor, PredictedEdge, PredictedView
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
-from modeler.suggestion.surface_cells import IntArray, Stand, SurfaceCells
+from modeler.suggestion.surface_cells import STEPS, IntArray, Stand, SurfaceCells
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -36,7 +36,6 @@ from modeler.types import (
 )
 
 _POINTS: Final = 1500  # of a view, used to evaluate its surface
-_BIN_RAD: Final = np.radians(15.0)  # half of a turn that changes visibility much
 _JOINED: Final = 0.85  # 17 of 20 recordings with a turned-over object gave one right model (docs/method/suggestion.md)
 _LEAST_MASS: Final = 0.03  # of a bin of turns that is evaluated
 
@@ -241,11 +240,12 @@ class Belief:
         If the images do not determine the turn, the view may be placed at any likely turn, and appears to show what is
         visible from there. Turns are grouped in bins of 15°, represented by their middle.
         """
-        bins = np.round(TURNS_RAD / _BIN_RAD).astype(np.intp)
+        bin_rad = 2.0 * np.pi / STEPS
+        bins = np.round(TURNS_RAD / bin_rad).astype(np.intp)
         masses = np.bincount(bins - bins.min(), edge.masses)
         kept = np.flatnonzero(masses >= _LEAST_MASS)
         shares = masses[kept] / masses[kept].sum()
-        turns_rad = _BIN_RAD * (kept + bins.min())
+        turns_rad = bin_rad * (kept + bins.min())
         return [
             (float(share), self.stand.turned(turn_rad) @ object_from_new)
             for share, turn_rad in zip(shares, turns_rad, strict=True)

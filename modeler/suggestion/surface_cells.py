@@ -31,7 +31,7 @@ _ALIKE = np.cos(np.radians(50.0))  # between normals of one face: edges stay
 _SURFACE_WITHIN, _SURFACE_BEYOND = 1.15, 0.24
 """Cells of new surface that a view shows per cell of hidden space seen head-on, fitted to 48 shapes of the tuning half
 (docs/method/suggestion.md). Slanted surface is larger than the area that it covers in a view."""
-_STEPS = 24  # of 15°: turns that determine the visible surface
+STEPS = 24  # of 15°: turns that determine the visible surface, twice as near as those that change it much
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +215,8 @@ class SurfaceCells:
     def around(self, object_from_camera: Array) -> BoolArray:
         """Return which cells (c,) a camera sees at any turn of the object on its table."""
         seen = np.zeros(len(self.points_m), dtype=bool)
-        for step in range(_STEPS):
-            turned = self.stand.turned(2.0 * np.pi * step / _STEPS) @ object_from_camera
+        for step in range(STEPS):
+            turned = self.stand.turned(2.0 * np.pi * step / STEPS) @ object_from_camera
             seen[self.visible(se3.inverse(turned))] = True
         return seen
 

@@ -21,7 +21,7 @@ NOISE_FRAMES: Final = 4
 
 _TILES_PX: Final = (48, 24)  # the first size with enough tiles: 24 px hold half of the area on captures, 96 px bends
 _MIN_TILES: Final = 10  # of a size; 5 or 20 give the same on captures
-_MARGIN_PX: Final = 8  # from the object and its mixed pixels
+WIDENED_PX: Final = 8  # by which depth cameras widen an outline at most: a D415 with hole filling by up to 8 px of 640
 _NOT_PLANE: Final = 4.0  # times the median of the tiles' variances
 _BALL_PX: Final = 6  # side of the squares over which errors are averaged, as by the smoothing of surface
 
@@ -72,7 +72,7 @@ def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
 
 def _inverse(depth_m: Float32Array, mask: BoolArray) -> Array:
     """Return inverse depth (h, w) in 1/m; NaN where nothing was measured and near a mask."""
-    measured = (depth_m > 0.0) & np.isfinite(depth_m) & (maximum_filter(mask, 2 * _MARGIN_PX + 1) == 0)
+    measured = (depth_m > 0.0) & np.isfinite(depth_m) & (maximum_filter(mask, 2 * WIDENED_PX + 1) == 0)
     return np.divide(1.0, depth_m, out=np.full(depth_m.shape, np.nan), where=measured)
 
 
