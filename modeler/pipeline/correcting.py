@@ -164,13 +164,7 @@ class Realigner:
         return self.tolerance_m or default_tolerance_m([*state.views.values()], state.solution.variance_factor)
 
     def _aligned_across(self, state: State, before: int, after: int) -> Generator[Searching, None, State | None]:
-        """Return a state with another alignment of the frames from one on with those before; None without one.
-
-        Args:
-            state: with all edges.
-            before: number of a frame.
-            after: number of the next one, the first of those to align.
-        """
+        """Return a state with another alignment of the frames from one (`after`) on with those before; None if none."""
         state = state.with_spans()
         early = {frame for frame in state.views if state.places[frame] <= state.places[before]}
         target, source = state.parted(early), state.parted({*state.views} - early)

@@ -241,13 +241,7 @@ class Run:
     ) -> Generator[Step | Searching | Refining, None, tuple[State, FreeSpace]]:
         """Build the model anew of what moves with the object, while it violates free space less and keeps its frames.
 
-        Args:
-            realigner: judges it.
-            before: the state before the graph was solved.
-            free: free-space violations of the state after that.
-
-        Returns:
-            The state before its graph was solved, and the free-space violations after that.
+        States are those before the graph was solved, violations those after that.
         """
         known = {**before.lost, **{frame: self._again(view) for frame, view in before.views.items()}}
         known = {frame: known[frame] for frame in before.places if frame in known}
@@ -312,15 +306,7 @@ class Run:
     def _placed(
         self, state: State, prepared: Prepared, first: int | None, stage: Stage = "track", *, last: bool = False
     ) -> Generator[Searching, None, Placed]:
-        """Register a frame and add it to the graph.
-
-        Args:
-            state: before it.
-            prepared: the frame.
-            first: number of the view to register it against first, if any.
-            stage: whose attempts are made.
-            last: whether it is the last of the sequence.
-        """
+        """Register a frame, against a view `first`, if any, and then others, and add it to the graph."""
         tracker, closer, number = self.modeler.tracker(state), self.modeler.closer, prepared.frame.index
         view = None if prepared.view is None else tracker.ready(prepared.view)
         posteriors, placement = (), Placement()
@@ -366,11 +352,8 @@ class Run:
     def _with_focal_length(self, state: State, sigma: float) -> tuple[State, FocalLength]:
         """Return a state under the focal length estimated from its loops, and the estimate.
 
-        If it is far from the given one, edges are registered again, because their derivatives are approximate.
-
-        Args:
-            state: with all edges.
-            sigma: prior standard deviation of the focal length's logarithm.
+        If it is far from the given one, edges are registered again, because their derivatives are approximate. `sigma`
+        is the prior standard deviation of its logarithm.
         """
         at, sensor = 0.0, self.modeler.sensor
 

@@ -284,13 +284,9 @@ class Tracker:
         nothing: Tracked | None = None,
         unmasked: Frame | None = None,
     ) -> Tracked:
-        """Return the object with any rotation.
+        """Return the object with any rotation, in views of the frame with one mask each; without any, `nothing`.
 
-        Args:
-            views: of the frame, each with another mask.
-            rng: source of all randomness.
-            nothing: what is returned without any view.
-            unmasked: the frame, if masks are guesses.
+        The frame is given (`unmasked`) if masks are guesses.
         """
         absent, best, least, rough = nothing, None, -np.inf, []
         for view in views:

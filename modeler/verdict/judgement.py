@@ -141,16 +141,7 @@ def _found(
     *,
     free: FreeSpace | None,
 ) -> list[_Finding]:
-    """Return the evidence of a whole run.
-
-    Args:
-        step: the last.
-        frames: results of all frames.
-        edges: those that take part.
-        prior: of the motions.
-        tolerance_m: error of the surface above which a model is wrong.
-        free: the free-space violations, if they can be evaluated.
-    """
+    """Return the evidence of a whole run, from its last step, all frames, the edges that take part, and the prior."""
     views, solution, found = step.views, step.solution, []
     accepted = [frame for frame in frames if frame.accepted]
     if accepted:
@@ -269,10 +260,7 @@ def _spreads(step: Step, edges: Sequence[Edge], tolerance_m: float, about_mean: 
 def _explained(spread: _Finding, by_focal: float, focal: FocalLength | None) -> _Finding:
     """Return a finding on the uncertainty of poses, with the reason if the focal length causes most of the variance.
 
-    Args:
-        spread: the finding.
-        by_focal: standard deviation caused by the focal length alone, in the finding's unit.
-        focal: estimate of the focal length.
+    `by_focal` is the standard deviation caused by the focal length alone, in the finding's unit.
     """
     if focal is None or 2.0 * by_focal**2 < spread.check.value**2:
         return spread
@@ -298,10 +286,6 @@ def _left_out(frames: Sequence[FrameRecord], segment_of: Mapping[int, int]) -> l
     """Return in words which frames were left out and why, consecutive ones with the same reason together.
 
     Frames between two segments are not included: they show at most the object in a hand that turns it over.
-
-    Args:
-        frames: results of all frames.
-        segment_of: number of its segment by frame number.
     """
     words, ordered = [], sorted(frames, key=lambda frame: frame.id)
     before = list(itertools.accumulate((segment_of.get(frame.id) for frame in ordered), _latest))
@@ -326,13 +310,7 @@ def _latest(before: int | None, now: int | None) -> int | None:
 
 
 def _open_loop(step: Step, edges: Sequence[Edge], *, closure_expected: bool) -> list[Shortcoming]:
-    """Return the reason if no loop was closed although one is expected.
-
-    Args:
-        step: the latest.
-        edges: those that take part.
-        closure_expected: whether the object is known to come back to its start.
-    """
+    """Return the reason if no loop was closed although the object is known to come back to its start."""
     if loops_closed(edges):
         return []
     closures = [edge for edge in step.edges_so_far if edge.kind == "closure"]
