@@ -254,7 +254,8 @@ class Console:
         self._bar.stop()
         self._release()
         for doubt, frames in self._doubts.items():
-            self._say(f"{len(frames)} of {len(self._placed)} frames: {doubt.label}: {outcome_advice(doubt)}")
+            if frames:
+                self._say(f"{len(frames)} of {len(self._placed)} frames: {doubt.label}: {outcome_advice(doubt)}")
 
     @property
     def watched(self) -> bool:
@@ -298,6 +299,8 @@ class Console:
         frame, accepted = step.frame.index, step.accepted
         before, self._placed[frame] = self._placed.get(frame), accepted
         mask = step.segmentation.outcome
+        for frames in self._doubts.values():
+            frames.discard(frame)  # which may have another mask by now
         if accepted and mask in (Outcome.UNSURE_MASK, Outcome.CUT_OFF):
             self._doubts.setdefault(mask, set()).add(frame)
         self._expect()

@@ -67,7 +67,7 @@ class Prepared:
 
 
 def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) -> Prepared:
-    """Segment a frame and prepare it for registration.
+    """Segment a frame and prepare it for registration: the object, and what a moving camera sees beside it.
 
     Args:
         frame: as read.
@@ -76,10 +76,11 @@ def prepare(frame: Frame, scene: Scene, segmenter: Segmenter, sensor: Sensor) ->
         sensor: of the camera.
     """
     segmentation = segmenter.segment(frame, scene)
-    if segmentation.outcome not in SEGMENTED:
+    seen = segmenter.with_surroundings(frame, segmentation, scene)
+    if seen.outcome not in SEGMENTED:
         return Prepared(frame, segmentation, None)
-    view = sensor.ray_image(replace(frame, mask=segmentation.mask), segmentation.plane)
-    return Prepared(frame, segmentation, view if len(view.points_m) else None)
+    view = sensor.ray_image(replace(frame, mask=seen.mask), seen.plane)
+    return Prepared(frame, replace(seen, mask=segmentation.mask), view if len(view.points_m) else None)
 
 
 @dataclass(frozen=True, eq=False)

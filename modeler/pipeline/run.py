@@ -27,15 +27,18 @@ from modeler.pipeline.correcting import (
 from modeler.pipeline.newest import with_last
 from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import Placed, State
+from modeler.pipeline.still_scene import CELL, agreeing, by_most
 from modeler.segmentation import Scene
 from modeler.system.concurrency import prefetching
 from modeler.types import (
+    BoolArray,
     Edge,
     FocalLength,
     Frame,
     FrameRecord,
     Fusing,
     NotJoined,
+    Outcome,
     Posterior,
     RayImage,
     Refining,
@@ -76,6 +79,7 @@ class Run:
     def __post_init__(self) -> None:
         """Start with an empty preview."""
         self._preview = Preview(self.modeler.fuser)
+        self._found: dict[int, BoolArray] = {}  # masks of the object in views that show what is beside it as well
         self._solved: State | None = None
 
     def track(self, frames: Iterable[Frame], *, live: bool = False) -> Iterator[Step | Searching]:
@@ -94,6 +98,7 @@ class Run:
             for prepared, last in ((one, False) for one in coming) if live else with_last(coming):
                 found = prepared()
                 self.state = self.state.read(found)
+                self._note(found)
                 placed = yield from self._placed(self.state, found, self.state.latest, last=last)
                 yield self._after(placed)
 
@@ -110,6 +115,7 @@ class Run:
             for preparation, _ in with_last(map(preparing, frames)):  # reads one ahead, which is prepared meanwhile
                 prepared = preparation()
                 self.state = self.state.inserted(prepared)
+                self._note(prepared)
                 nearest = self.state.map_view.nearest_in_time(prepared.frame.index)
                 first = nearest[0] if nearest else None
                 placed = yield from self._placed(self.state, prepared, first, "fill")
@@ -189,12 +195,13 @@ class Run:
         if newest is None:
             return
         self._solve()
+        yield from self._cut_out()
         if self.state.views:
             yield Fusing()
             conditional = conditional_covariances(self.state.solution, self.state.graph.edges)
             model = self.modeler.fuser.fuse(self.state.views, self.state.solution.trajectory, conditional)
             model = widened(model, self.state.solution)
-        spans = self.state.spans
+        newest, spans = self.state.newest or newest, self.state.spans
         last = self._step(newest, [edge.posterior for edge in spans], spans)
         last = replace(last, last=True, make_model=lambda: model)
         verdict = judged(
@@ -279,10 +286,40 @@ class Run:
             found = kept.state if shown else replace(kept.state, newest=self.state.newest)
             self.state = self._solved = found
             for frame in (frame for frame in known if frame in found.views or frame in found.lost):
-                one = self._again(found.views[frame]) if frame in found.views else found.lost[frame]
-                edges = [edge for edge in found.graph.edges if edge.source == frame and edge.kind != "span"]
-                yield self._step(one, [edge.posterior for edge in edges], edges)
+                yield self._once_more(self._again(found.views[frame]) if frame in found.views else found.lost[frame])
         return before, free
+
+    def _once_more(self, prepared: Prepared) -> Step:
+        """Return the event of a frame that has another mask by now."""
+        number = prepared.frame.index
+        edges = [edge for edge in self.state.graph.edges if edge.source == number and edge.kind != "span"]
+        return self._step(prepared, [edge.posterior for edge in edges], edges)
+
+    def _note(self, prepared: Prepared) -> None:
+        """Keep the object's mask where the view has what is beside it as well."""
+        if self.scene.reach_m > 0.0 and prepared.view is not None and prepared.frame.mask is None:
+            self._found[prepared.frame.index] = prepared.segmentation.mask
+
+    def _cut_out(self) -> Iterator[Step]:
+        """Leave what is beside the object out of the views of a moving camera; yield the steps of their frames."""
+        views = {frame: view for frame, view in self.state.views.items() if frame in self._found}
+        if not views:
+            return
+        masks = by_most(views, self._found, self.state.solution.trajectory, self.scene.reach_m * CELL)
+        sure, cut = agreeing(masks, self._found), dict(self.state.views)
+        for frame, view in views.items():
+            label = self.records[frame].mask
+            if Outcome(label) is not Outcome.CUT_OFF:
+                label = (Outcome.CONVERGED if sure else Outcome.UNSURE_MASK).label
+            one = remasked(segmented(view, label), masks[frame], self.modeler.sensor)
+            if one.view is None:  # all of it stays, and is judged
+                one = segmented(view, Outcome.UNSURE_MASK.label)
+            assert one.view is not None
+            cut[frame] = self.state.store.keep(one.view)
+            if (newest := self.state.newest) is not None and newest.frame.index == frame:
+                self.state = replace(self.state, newest=replace(one, view=cut[frame]))
+            self.state = self._solved = replace(self.state, views={**cut}, ready={})
+            yield self._once_more(replace(one, view=cut[frame]))
 
     def _again(self, view: RayImage) -> Prepared:
         """Return a frame of the model as it was segmented."""

@@ -77,6 +77,8 @@ class Scene:
     """Whether camera and background are static, so that the scene holds for other frames."""
     camera_moves: bool = False
     """Whether so much changes from frame to frame that the camera itself must move."""
+    reach_m: float = 0.0
+    """Distance from the object's middle within which a moving camera sees what stands still beside it; 0: unknown."""
     alone: bool = False
     """Whether the frames show nothing but the object."""
     noise: DepthNoise | None = None

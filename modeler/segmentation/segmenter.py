@@ -24,8 +24,8 @@ from modeler.segmentation.depth_images import (
 from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, nearest_seen_m
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
-from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation, checked, spread
-from modeler.views.range_noise import NOISE_FRAMES, RangeNoise, range_noise
+from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation, checked
+from modeler.views.range_noise import RangeNoise, range_noise
 from modeler.views.rays import closed, gap_px, interpolated, measured_share
 
 _CHANGES = 2.0
@@ -34,6 +34,7 @@ the expected one: noise of a camera that stands still is the same in both to its
 _LEAST_NOISE = 0.4  # of the expected noise: edges change by more than a rim; with 0.2, masks are as good
 _PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
+_REACH = 3.0  # radii of a mask about its middle: with 2, frames with other masks share less; whole images dilute it
 
 _Look = tuple[Frame, Found]
 
@@ -83,8 +84,9 @@ class Segmenter:
             return Scene(alone=True)
         scene = self._learn(shown)
         if not scene.still:
-            few = spread(shown, NOISE_FRAMES)
-            return replace(scene, range_noise=range_noise([(frame, self.segment(frame, scene).mask) for frame in few]))
+            seen = [(frame, self.segment(frame, scene).mask) for frame in shown]
+            reach_m = _REACH * float(np.median([_radius_m(*one) for one in seen])) if scene.camera_moves else 0.0
+            return replace(scene, range_noise=range_noise(seen), reach_m=reach_m)
         if scene.zone_m is None:
             return scene
         # A second pass: whole masks determine zone and visible area better than the moving pixels.
@@ -156,6 +158,26 @@ class Segmenter:
             sure &= scene.areas_m2[0] / AREA_FACTOR < found.area_m2 < scene.areas_m2[1] * AREA_FACTOR
         whole = Outcome.CUT_OFF if is_cut(mask, scene.edge) else Outcome.CONVERGED
         return Segmentation(mask, scene.plane, whole if sure else Outcome.UNSURE_MASK)
+
+    def with_surroundings(self, frame: Frame, found: Segmentation, scene: Scene) -> Segmentation:
+        """Return a segmentation with what stands beside the object, where the camera moves about both.
+
+        It determines the camera's motion where the object is nearly round, hardly seen, or not found.
+        """
+        depth_m = self._kept(frame)
+        known = np.isfinite(depth_m)
+        if frame.mask is not None or scene.reach_m == 0.0 or not known.any():
+            return found
+        points, mask = _points(frame), found.mask & known
+        if not mask.any():  # what stands at the middle of the image
+            height, width = known.shape
+            mask[height // 3 : 2 * height // 3 + 1, width // 3 : 2 * width // 3 + 1] = True
+            mask &= known
+        middle_m = np.median(points[mask if mask.any() else known], axis=0)
+        near: BoolArray = known & (np.linalg.norm(points - middle_m, axis=2) < scene.reach_m)
+        lost = found.outcome is Outcome.TOO_FEW_POINTS and np.count_nonzero(near) >= self.min_points
+        outcome = Outcome.UNSURE_MASK if lost else found.outcome
+        return Segmentation(found.mask | near, self._plane_beside(frame, found.mask | near), outcome)
 
     def _looks(self, frames: Sequence[Frame], scene: Scene) -> tuple[list[_Look], list[_Look]]:
         """Return frames with the object found in them; and those where it does not lead out of view, if at least half.
@@ -261,6 +283,14 @@ def _interpolated(frame: Frame) -> Frame:
 def _measured(frame: Frame) -> Float32Array:
     """Return a copy of the depth (h, w) with NaN for missing measurements."""
     return np.where(frame.depth_m > 0.0, frame.depth_m, np.float32(np.nan)).astype(np.float32, copy=False)
+
+
+def _radius_m(frame: Frame, mask: BoolArray) -> float:
+    """Return the distance in m from the middle of a mask's points within which nearly all of them are."""
+    points = _points(frame)[mask & (frame.depth_m > 0.0)]
+    return (
+        float(np.percentile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 98.0)) if len(points) else 0.0
+    )
 
 
 def _points(frame: Frame, stride: int = 1) -> Float32Array:

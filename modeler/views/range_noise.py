@@ -16,12 +16,10 @@ from scipy.ndimage import maximum_filter
 
 from modeler.types import Array, BoolArray, Float32Array, Frame, spread
 
-NOISE_FRAMES: Final = 4
-"""Frames that are looked at: more are redundant."""
-
 _TILES_PX: Final = (48, 24)  # the first size with enough tiles: 24 px hold half of the area on captures, 96 px bends
 _MIN_TILES: Final = 10  # of a size; 5 or 20 give the same on captures
 WIDENED_PX: Final = 8  # by which depth cameras widen an outline at most: a D415 with hole filling by up to 8 px of 640
+_FRAMES: Final = 4  # more are redundant
 _NOT_PLANE: Final = 4.0  # times the median of the tiles' variances
 _BALL_PX: Final = 6  # side of the squares over which errors are averaged, as by the smoothing of surface
 
@@ -49,7 +47,7 @@ def range_noise(looks: Sequence[tuple[Frame, BoolArray]]) -> RangeNoise | None:
     Args:
         looks: frames with masks (h, w) of the object, of which a few are looked at. Pixels without depth are 0 or NaN.
     """
-    images = [_inverse(frame.depth_m, mask) for frame, mask in spread(looks, NOISE_FRAMES)]
+    images = [_inverse(frame.depth_m, mask) for frame, mask in spread(looks, _FRAMES)]
     for tile_px in _TILES_PX:
         residuals = [_left_of_planes(image, tile_px) for image in images]
         limit = _NOT_PLANE * _median_variance(residuals)
