@@ -19,12 +19,14 @@ from typing import Final
 
 from studies.results.tables import FOLDER, record
 from studies.side_by_side import results
-from studies.whole.plan import HALVES, Plan
+from studies.whole.plan import HALVES, Plan, led_round
 from studies.whole.study import earlier, outcome
 from studies.whole.tables import counts, text
 
 CAPTURES: Final = 160
 """Of a half."""
+LED_ROUND: Final = 24
+"""Of a half, of cameras that are led round the object."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,24 +38,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--half", choices=HALVES, default="tuning", help="which meshes and draws")
     parser.add_argument("--captures", type=int, default=CAPTURES, metavar="N", help="of the half")
     parser.add_argument("--only", type=int, nargs="+", metavar="NUMBER", help="only these captures")
+    parser.add_argument("--led-round", action="store_true", help="the camera is led round the object, without masks")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs side by side")
     parser.add_argument("--out", type=Path, default=Path("runs/whole"), help="folder of the results")
     parser.add_argument("--record", action="store_true", help="put the counts by factor into the results")
     options = parser.parse_args(arguments)
     if options.captures < 1 or options.jobs < 1:
         parser.error("--captures and --jobs take whole numbers from 1 on")
-    if options.record and (options.half != "held-out" or options.captures != CAPTURES or options.only):
-        parser.error(f"the results are of all {CAPTURES} captures of the held-out half")
+    most = LED_ROUND if options.led_round else CAPTURES
+    if options.record and (options.half != "held-out" or options.captures != most or options.only):
+        parser.error(f"the results are of {most} captures of the held-out half")
     options.out.mkdir(parents=True, exist_ok=True)
     plans = [
         Plan(options.half, number)
         for number in range(options.captures)
         if options.only is None or number in options.only
     ]
-    path = options.out / f"{options.half}.jsonl"
+    path = options.out / f"{options.half}{', led round' if options.led_round else ''}.jsonl"
     done = earlier(path)
     missing = [plan for plan in plans if plan.number not in done]
-    work = [partial(outcome, options.things, plan) for plan in missing]
+    drawn = {"drawn": led_round} if options.led_round else {}
+    work = [partial(outcome, options.things, plan, **drawn) for plan in missing]
     began = time.perf_counter()
     with path.open("a") as stream:
         for number, one in enumerate(results(work, options.jobs), 1):
@@ -69,7 +74,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     outcomes = [done[plan.number] for plan in plans]
     print(text(outcomes))
     if options.record:
-        record(FOLDER / "whole.json", counts(outcomes))
+        if options.led_round:
+            record(
+                FOLDER / "led_round.json",
+                [row for row in counts(outcomes) if str(row[0]).startswith(("all", "camera", "colour"))],
+            )
+        else:
+            record(FOLDER / "whole.json", counts(outcomes))
     return 0
 
 

@@ -77,7 +77,7 @@ class Capture(AbstractSequence):
 
     def truth(self) -> dict[int, Array]:
         """Return the true camera_from_model (4, 4) by frame number."""
-        return {index: self._camera_from_support @ self._motion[0][index] for index in self.indices}
+        return {index: self._camera_from_support_in(index) @ self._support_from_object(index) for index in self.indices}
 
     def frame(self, index: int) -> Frame:
         """Return a frame as it is handed over."""
@@ -142,6 +142,19 @@ class Capture(AbstractSequence):
         pose[:3, :3], pose[:3, 3] = axes, offset_m - axes @ middle_m
         return pose
 
+    def _camera_from_support_in(self, index: int) -> Array:
+        """Return the pose (4, 4) of the support in a frame; a hand that leads the camera round it is never steady."""
+        if not self.factors.led_round:
+            return self._camera_from_support
+        rng, distance_m = np.random.default_rng([self.seed, 5, index]), self.factors.distance_m
+        middle_m = np.array([0.0, 0.0, distance_m])
+        shake = se3.exp(np.array([*np.radians(rng.normal(0.0, [5.0, 2.0, 3.0])), 0.0, 0.0, 0.0]))
+        shake[:3, 3] = middle_m - shake[:3, :3] @ middle_m + distance_m * rng.normal(0.0, [0.03, 0.03, 0.05])
+        return shake @ self._camera_from_support @ self._motion[0][index] @ se3.inverse(self._motion[0][0])
+
+    def _support_from_object(self, index: int) -> Array:
+        return self._motion[0][0 if self.factors.led_round else index]
+
     @cached_property
     def _frames(self) -> tuple[Frame, ...]:
         return tuple(self._shot(index) for index in self.indices)
@@ -199,7 +212,9 @@ class Capture(AbstractSequence):
         import open3d as o3d
 
         drawn, size_m = self.factors, self.factors.size_m
-        parts = [(_OBJECT, self.mesh.vertices, self.mesh.triangles, self._motion[0][index])]
+        parts = [(_OBJECT, self.mesh.vertices, self.mesh.triangles, self._support_from_object(index))]
+        if drawn.led_round:
+            parts += self._beside()
         if drawn.support in ("table", "turntable"):
             table = _quad(([-5.0, -5.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0]), size_m)
             parts.append((_BELOW, *table, np.eye(4)))
@@ -213,13 +228,22 @@ class Capture(AbstractSequence):
             parts.append((_HAND, *_forearm(size_m), pose))
         scene, owners = o3d.t.geometry.RaycastingScene(), []
         for owner, vertices_m, triangles, support_from_part in parts:
-            camera_from_part = self._camera_from_support @ support_from_part
+            camera_from_part = self._camera_from_support_in(index) @ support_from_part
             scene.add_triangles(
                 o3d.core.Tensor.from_numpy(se3.transform(camera_from_part, vertices_m).astype(np.float32)),
                 o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
             )
             owners.append(owner)
         return scene, np.array(owners)
+
+    def _beside(self) -> list[tuple[int, Array, npt.NDArray[np.int64], Array]]:
+        """Return three other things on the table: whose they are, vertices, triangles, and pose over the support."""
+        rng, size_m, found = np.random.default_rng([self.seed, 6]), self.factors.size_m, []
+        for thing in rng.choice(np.array([*self.things], dtype=object), 3):
+            angle, away_m = rng.uniform(0.0, 2.0 * np.pi), size_m * rng.uniform(1.3, 2.2)
+            place = se3.translation(np.array([away_m * np.cos(angle), away_m * np.sin(angle), 0.0]))
+            found.append((_BEHIND, size_m * rng.uniform(0.4, 0.9) * thing.vertices, thing.triangles, place))
+        return found
 
     @staticmethod
     def _cast(
@@ -239,10 +263,11 @@ class Capture(AbstractSequence):
         """Return the colour image (h, w, 3)."""
         drawn = self.factors
         image = np.full((*owner.shape, 3), 20.0)
-        frames = {_OBJECT: self._camera_from_support @ self._motion[0][index]}
+        still = self._camera_from_support_in(index)
+        frames = {_OBJECT: still @ self._support_from_object(index)}
         for kind in (_OBJECT, _BELOW, _BEHIND, _HAND):
             own = owner == kind
-            part_from_camera = se3.inverse(frames.get(kind, self._camera_from_support))
+            part_from_camera = se3.inverse(frames.get(kind, still))
             places = se3.transform(part_from_camera, points_m[own]) / drawn.size_m
             directions = normals[own] @ part_from_camera[:3, :3].T
             if kind == _HAND:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal, final
 
 import numpy as np
@@ -81,11 +81,31 @@ class Factors:
     """Logarithm of the given focal length over the true one."""
     kind_told: bool
     """Whether the camera's kind is known, as formats of devices say it and folders may."""
+    led_round: bool = False
+    """Whether the camera is led round the object, which lies still among other things."""
 
     @property
     def share(self) -> float:
         """Return the object's size in the image as a share of the image's height."""
         return self.size_m * self.focal_px / (self.distance_m * 0.75 * self.width_px)
+
+
+def led_round(factors: Factors) -> Factors:
+    """Return the factors with a camera that somebody leads round the object on a table, and no masks."""
+    return replace(
+        factors,
+        led_round=True,
+        support="table",
+        wall=0.0,
+        cut=0.0,
+        elevation_deg=max(factors.elevation_deg, 20.0),  # else things before it hide the object
+        steps="even",
+        step_deg=5.0 + 0.2 * factors.step_deg,
+        frames=12,
+        order="as turned",
+        masks="none",
+        told=False,
+    )
 
 
 @final
