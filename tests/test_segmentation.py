@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 from segmentation_worlds import CAMERA, OBJECT, World, iou
 from slow_cases import quick_first
 
-from modeler.pipeline import Modeler
-from modeler.pipeline.still_scene import agreeing, by_most
 from modeler.segmentation import DepthNoise, Scene, Segmenter
 from modeler.segmentation.depth_images import (
     change_at_rim,
@@ -26,7 +24,6 @@ from modeler.segmentation.depth_images import (
 )
 from modeler.sequences.bop import BopSequence
 from modeler.types import Camera, Frame, Outcome
-from modeler.views import Sensor
 
 
 def turned(count, rng, surround=lambda world, k: world, **camera):
@@ -682,54 +679,3 @@ def test_noise_of_a_camera_that_stands_still_is_as_large_within_frames_as_betwee
     noisier = noise.times(6.0, 0.7)
     assert noisier.sigma_m(np.array(0.7)) == pytest.approx(6.0 * noise.sigma_m(np.array(0.7)))
     assert noisier.sigma_m(np.array(0.2)) < 2.0 * noise.sigma_m(np.array(0.2))
-
-
-def going_round(count, rng):
-    """Return frames of a camera that is led round a table with three things, and the true pixels of the middle one."""
-    views = []
-    for k in range(count):
-        world = World(tilt_deg=35.0 + 4.0 * np.sin(k), distance_m=0.7 + 0.05 * np.cos(2.0 * k), turn_deg=12.0 * k)
-        world.table().box((0.0, 0.0, 0.05), (0.05, 0.03, 0.05), label=OBJECT)
-        world.box((0.17, 0.05, 0.04), (0.03, 0.05, 0.04)).box((-0.12, 0.15, 0.03), (0.04, 0.02, 0.03), turn_deg=40.0)
-        views.append(world.frame(k, rng))
-    return [frame for frame, _ in views], [mask for _, mask in views]
-
-
-def test_a_camera_that_moves_sees_what_stands_beside_the_object(rng):
-    frames, masks = going_round(8, rng)
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    assert scene.camera_moves
-    for frame, mask in zip(frames, masks, strict=True):
-        found = segmenter.segment(frame, scene)
-        seen = segmenter.with_surroundings(frame, found, scene)
-        assert np.count_nonzero(seen.mask & ~mask) > np.count_nonzero(mask)
-        assert np.count_nonzero(seen.mask & mask) > 0.9 * np.count_nonzero(mask)
-        assert seen.plane is not None
-        nothing = replace(found, mask=np.zeros_like(mask), outcome=Outcome.TOO_FEW_POINTS)
-        assert np.count_nonzero(segmenter.with_surroundings(frame, nothing, scene).mask & mask) > 0
-        given = replace(frame, mask=mask)
-        assert segmenter.with_surroundings(given, segmenter.segment(given, scene), scene).mask.sum() <= mask.sum()
-
-
-def test_a_model_of_a_moving_camera_is_of_the_object_alone(rng):
-    frames, masks = going_round(8, rng)
-    method = Modeler()
-    *_, last = method.run(frames, method.segmenter.scene(frames))
-    assert [frame.id for frame in last.frames_so_far if frame.accepted] == list(range(8))
-    for frame, mask in zip(frames, masks, strict=True):
-        assert iou(last.views[frame.index].frame.mask, mask) > 0.85
-
-
-def test_masks_of_a_still_scene_are_those_of_most_views():
-    camera, rng = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), np.random.default_rng(0)
-    depth_m = np.full((48, 64), 0.5, np.float32) + rng.normal(0.0, 1e-4, (48, 64)).astype(np.float32)
-    true, wrong = np.zeros((2, 48, 64), dtype=np.bool_)
-    true[15:30, 20:40], wrong[5:12, 45:60] = True, True
-    views = {k: Sensor().ray_image(Frame(k, float(k), depth_m, camera, np.ones_like(true))) for k in range(5)}
-    found = {k: wrong if k == 3 else true for k in views}
-    masks = by_most(views, found, dict.fromkeys(views, np.eye(4)), 0.01)
-    for mask in masks.values():
-        assert iou(mask, true) > 0.9
-    assert agreeing(masks, found)
-    assert not agreeing(masks, dict.fromkeys(found, wrong))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import time
+import zipfile
+import zlib
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from modeler.export.files import PART, cloud_ply, g2o_text, mesh_ply, settle, settle_soon, tum_text, write_atomically
 from modeler.export.pairs import Pairs
@@ -16,10 +21,12 @@ from modeler.export.reading import fault
 from modeler.export.report import RunMeta, report_of
 from modeler.system.concurrency import Pace
 from modeler.system.regular_files import check_regular, read_json
-from modeler.types import InputError, Step
+from modeler.types import BoolArray, InputError, Step
 
 _REPORT = "report.json"
-_OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd")
+MASKS = "masks.npz"
+"""Masks (h, w) by frame number, of views whose masks are not those found in their frames alone."""
+_OURS = (_REPORT, "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", MASKS, "recording.rrd")
 """The report, without which nothing is resumed, goes first."""
 _PATHS = ("sequence", "sensor", "camera")  # entries of a report and of its settings that are paths
 PAGE = "report.html"  # page of `modeler report`; removed together with the run
@@ -229,6 +236,10 @@ class RunFolder:
         }
         if step.last and step.model is not None:
             contents |= {"cloud.ply": cloud_ply(step.model), "model.ply": mesh_ply(step.model)}
+        if step.last and step.remasked:
+            masks = {str(frame): np.asarray(step.views[frame].frame.mask) for frame in sorted(step.remasked)}
+            np.savez_compressed(packed := io.BytesIO(), allow_pickle=False, **masks)
+            contents[MASKS] = packed.getvalue()
         contents[_REPORT] = json.dumps(report, allow_nan=False) + "\n"
         for name, content in contents.items():
             write_atomically(self.path / name, content, lasting=step.last)
@@ -236,6 +247,22 @@ class RunFolder:
             settle_soon(*(self.path / name for name in contents), self.path)
         self.pace.took(time.monotonic() - began_s)
         return report
+
+    def masks(self) -> dict[int, BoolArray]:
+        """Return the masks (h, w) of views, by frame number, that are not those found in their frames alone.
+
+        Raises:
+            InputError: if they cannot be read.
+        """
+        path = self.path / MASKS
+        if not path.exists():
+            return {}
+        check_regular(path)
+        try:
+            with np.load(path, allow_pickle=False) as masks:
+                return {int(frame): np.asarray(masks[frame], dtype=np.bool_) for frame in masks}
+        except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); build the run again") from error
 
     def finish(self) -> None:
         """Bring the recording to the disk; take the mark of an unfinished run away unless it ended early.

@@ -79,6 +79,7 @@ class Run:
     def __post_init__(self) -> None:
         """Start with an empty preview."""
         self._preview = Preview(self.modeler.fuser)
+        self._remasked_views: set[int] = set()
         self._found: dict[int, BoolArray] = {}  # masks of the object in views that show what is beside it as well
         self._solved: State | None = None
 
@@ -203,7 +204,7 @@ class Run:
             model = widened(model, self.state.solution)
         newest, spans = self.state.newest or newest, self.state.spans
         last = self._step(newest, [edge.posterior for edge in spans], spans)
-        last = replace(last, last=True, make_model=lambda: model)
+        last = replace(last, last=True, make_model=lambda: model, remasked=self._remasked_views & {*self.state.views})
         verdict = judged(
             last,
             interrupted=interrupted,
@@ -282,6 +283,7 @@ class Run:
                 break
         if kept is not self:
             self.records.update(kept.records)
+            self._remasked_views |= {*kept.state.views}
             shown = self.state.newest is None or self.state.newest.view is not None
             found = kept.state if shown else replace(kept.state, newest=self.state.newest)
             self.state = self._solved = found
@@ -305,6 +307,7 @@ class Run:
         views = {frame: view for frame, view in self.state.views.items() if frame in self._found}
         if not views:
             return
+        self._remasked_views |= {*views}
         masks = by_most(views, self._found, self.state.solution.trajectory, self.scene.reach_m * CELL)
         sure, cut = agreeing(masks, self._found), dict(self.state.views)
         for frame, view in views.items():

@@ -219,6 +219,7 @@ def _last_step(work: Work, voxel_m: float | None) -> Step:
         edges_so_far=edges,
         frames_so_far=tuple(sorted(records, key=lambda record: record.id)),
         last=True,
+        remasked={k + part.offset for one in work.parts for part in one.parts for k in part.masks} & views.keys(),
     )
 
 

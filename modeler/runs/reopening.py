@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +16,7 @@ from modeler.export import RunFolder, edges_of, poses_of
 from modeler.fusion import Fuser, FusionVolume, conditional_covariances, widened
 from modeler.graph import MovingGraph, PoseGraph, solve
 from modeler.pipeline import Modeler
+from modeler.pipeline.pairs import SEGMENTED
 from modeler.segmentation import Scene, scene_frames
 from modeler.sequences import (
     AbstractSequence,
@@ -26,7 +27,7 @@ from modeler.sequences import (
     read_focal_factor,
     read_noise,
 )
-from modeler.types import ACCEPTED, Array, Edge, InputError, ObjectModel, RayImage, Solution
+from modeler.types import ACCEPTED, Array, BoolArray, Edge, InputError, ObjectModel, RayImage, Solution
 from modeler.views import Sensor
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
@@ -46,6 +47,8 @@ class Part:
     """Offset of its frame numbers in the joined run."""
     later_s: float = 0.0
     """By how much its frames are later in the joined run."""
+    masks: Mapping[int, BoolArray] = field(default_factory=dict)
+    """Masks (h, w), by its own frame numbers, of views whose masks are not those found in their frames alone."""
 
     @property
     def accepted(self) -> tuple[int, ...]:
@@ -97,8 +100,16 @@ class Part:
     def view(self, frame: int) -> RayImage | None:
         """Return the view of a frame, its own number, as it is in the joined run; None if no object is found in it."""
         modeler, scene = self.looking
-        view = modeler.prepare(self.sequence.frame(frame), scene).view
-        if view is None:
+        images, known = self.sequence.frame(frame), self.masks.get(frame)
+        found = modeler.segmenter.segment(images, scene)
+        if known is not None and known.shape == images.depth_m.shape:
+            plane = modeler.segmenter.with_surroundings(images, found, scene).plane
+            view = self.sensor.ray_image(replace(images, mask=known), plane)
+        elif found.outcome in SEGMENTED:
+            view = self.sensor.ray_image(replace(images, mask=found.mask), found.plane)
+        else:
+            return None
+        if not len(view.points_m):
             return None
         log_factor = math.log((self.report.get("camera") or {}).get("factor_in_run", 1.0))
         view = self.sensor.refocused(view, log_factor) if log_factor else view
@@ -171,7 +182,9 @@ def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> t
         raise InputError(f"{where}: the sequence of {run} does not exist; give its new place with `sequence`")
     sensor, camera = (folder.located(settings[name]) if name in settings else None for name in ("sensor", "camera"))
     sequence = calibrated(open_sequence(where, _overrides(settings)), sensor, camera)
-    return (*first, Part(run, report, sequence, int(settings.get("offset", 0)), float(settings.get("later_s", 0.0))))
+    offset, later_s = int(settings.get("offset", 0)), float(settings.get("later_s", 0.0))
+    masks = {frame - offset: mask for frame, mask in folder.masks().items()}
+    return (*first, Part(run, report, sequence, offset, later_s, masks))
 
 
 def _of_recording(report: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from sys import intern
@@ -177,6 +177,8 @@ class Step:
     """True for the final step."""
     verdict: Verdict | None = None
     """Whether the model can be trusted; only the final step has one."""
+    remasked: Collection[int] = ()
+    """Numbers of the views whose masks are not those found in their frames alone; in the final step."""
 
     @cached_property
     def model(self) -> ObjectModel | None:

@@ -1,0 +1,83 @@
+"""Models of an object that lies still among others before a camera that moves."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from segmentation_worlds import CAMERA, OBJECT, World, iou
+
+import modeler
+from modeler.pipeline.still_scene import agreeing, by_most
+from modeler.runs.joining import edit
+from modeler.runs.reopening import reopened
+from modeler.segmentation import Segmenter
+from modeler.types import Camera, Frame, Outcome
+from modeler.views import Sensor
+
+
+@pytest.fixture(scope="module")
+def going_round():
+    """Frames of a camera that is led round a table with three things, and the true pixels of the middle one."""
+    views, rng = [], np.random.default_rng(0)
+    for k in range(8):
+        world = World(tilt_deg=35.0 + 4.0 * np.sin(k), distance_m=0.7 + 0.05 * np.cos(2.0 * k), turn_deg=12.0 * k)
+        world.table().box((0.0, 0.0, 0.05), (0.05, 0.03, 0.05), label=OBJECT)
+        world.box((0.17, 0.05, 0.04), (0.03, 0.05, 0.04)).box((-0.12, 0.15, 0.03), (0.04, 0.02, 0.03), turn_deg=40.0)
+        views.append(world.frame(k, rng))
+    return [frame for frame, _ in views], [mask for _, mask in views]
+
+
+def test_a_view_holds_what_stands_beside_the_object(going_round):
+    frames, masks = going_round
+    segmenter = Segmenter()
+    scene = segmenter.scene(frames)
+    assert scene.camera_moves
+    for frame, mask in zip(frames, masks, strict=True):
+        found = segmenter.segment(frame, scene)
+        seen = segmenter.with_surroundings(frame, found, scene)
+        assert np.count_nonzero(seen.mask & ~mask) > np.count_nonzero(mask)
+        assert np.count_nonzero(seen.mask & mask) > 0.9 * np.count_nonzero(mask)
+        assert seen.plane is not None
+        nothing = replace(found, mask=np.zeros_like(mask), outcome=Outcome.TOO_FEW_POINTS)
+        assert (segmenter.with_surroundings(frame, nothing, scene).mask & mask).any()
+        given = replace(frame, mask=mask)
+        alone = segmenter.segment(given, scene)
+        assert segmenter.with_surroundings(given, alone, scene) is alone
+
+
+def test_a_model_is_of_the_object_alone_and_stays_so_when_its_run_is_opened_again(going_round, tmp_path):
+    frames, masks = going_round
+    (tmp_path / "scan" / "depth").mkdir(parents=True)
+    intrinsics = {"fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy, "depth_scale": 0.1}
+    (tmp_path / "scan" / "camera.json").write_text(json.dumps(intrinsics))
+    for frame in frames:
+        units = np.rint(np.nan_to_num(frame.depth_m) / 1e-4).astype(np.uint16)
+        Image.fromarray(units).save(tmp_path / "scan" / "depth" / f"{frame.index:06d}.png")
+    found = modeler.build(tmp_path / "scan", tmp_path / "run")
+    assert sorted(found.solution.trajectory) == list(range(8))
+    again = reopened(tmp_path / "run")
+    for frame, mask in zip(frames, masks, strict=True):
+        assert iou(again.views[frame.index].frame.mask, mask) > 0.85
+    edit(tmp_path / "run", [3], tmp_path / "fewer", overwrite=False)
+    fewer = reopened(tmp_path / "fewer").views
+    assert sorted(fewer) == [0, 1, 2, 4, 5, 6, 7]
+    assert all(np.array_equal(view.frame.mask, again.views[frame].frame.mask) for frame, view in fewer.items())
+    (tmp_path / "fewer" / "masks.npz").write_bytes(b"no archive")
+    with pytest.raises(modeler.InputError, match=r"masks\.npz: cannot be read"):
+        reopened(tmp_path / "fewer")
+
+
+def test_masks_are_those_of_most_views():
+    camera, rng = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), np.random.default_rng(0)
+    depth_m = np.full((48, 64), 0.5, np.float32) + rng.normal(0.0, 1e-4, (48, 64)).astype(np.float32)
+    true, wrong = np.zeros((2, 48, 64), dtype=np.bool_)
+    true[15:30, 20:40], wrong[5:12, 45:60] = True, True
+    views = {k: Sensor().ray_image(Frame(k, float(k), depth_m, camera, np.ones_like(true))) for k in range(5)}
+    found = {k: wrong if k == 3 else true for k in views}
+    masks = by_most(views, found, dict.fromkeys(views, np.eye(4)), 0.01)
+    for mask in masks.values():
+        assert iou(mask, true) > 0.9
+    assert agreeing(masks, found)
+    assert not agreeing(masks, dict.fromkeys(found, wrong))
