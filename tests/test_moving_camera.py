@@ -9,7 +9,7 @@ from PIL import Image
 from segmentation_worlds import CAMERA, OBJECT, World, iou
 
 import modeler
-from modeler.pipeline.still_scene import agreeing, by_most
+from modeler.pipeline.still_scene import Majority
 from modeler.runs.joining import edit
 from modeler.runs.reopening import reopened
 from modeler.segmentation import Segmenter
@@ -76,8 +76,9 @@ def test_masks_are_those_of_most_views():
     true[15:30, 20:40], wrong[5:12, 45:60] = True, True
     views = {k: Sensor().ray_image(Frame(k, float(k), depth_m, camera, np.ones_like(true))) for k in range(5)}
     found = {k: wrong if k == 3 else true for k in views}
-    masks = by_most(views, found, dict.fromkeys(views, np.eye(4)), 0.01)
-    for mask in masks.values():
-        assert iou(mask, true) > 0.9
-    assert agreeing(masks, found)
-    assert not agreeing(masks, dict.fromkeys(found, wrong))
+    most = Majority(views, found.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01)
+    for frame in views:
+        assert iou(most.mask(frame), true) > 0.9
+    assert most.sure
+    other = {0: true, 1: true, 2: wrong, 3: wrong.T[:48, :48].repeat(2, axis=1)[:, :64], 4: ~true & ~wrong}
+    assert not Majority(views, other.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01).sure

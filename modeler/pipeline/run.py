@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from modeler.closure import Placement
 from modeler.fusion import Preview, conditional_covariances, widened
@@ -27,7 +30,7 @@ from modeler.pipeline.correcting import (
 from modeler.pipeline.newest import with_last
 from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import Placed, State
-from modeler.pipeline.still_scene import CELL, agreeing, by_most
+from modeler.pipeline.still_scene import CELL, Majority
 from modeler.segmentation import Scene
 from modeler.system.concurrency import prefetching
 from modeler.types import (
@@ -80,7 +83,7 @@ class Run:
         """Start with an empty preview."""
         self._preview = Preview(self.modeler.fuser)
         self._remasked_views: set[int] = set()
-        self._found: dict[int, BoolArray] = {}  # masks of the object in views that show what is beside it as well
+        self._found: dict[int, bytes] = {}  # masks of the object, where views show what is beside it as well
         self._solved: State | None = None
 
     def track(self, frames: Iterable[Frame], *, live: bool = False) -> Iterator[Step | Searching]:
@@ -300,29 +303,37 @@ class Run:
     def _note(self, prepared: Prepared) -> None:
         """Keep the object's mask where the view has what is beside it as well."""
         if self.scene.reach_m > 0.0 and prepared.view is not None and prepared.frame.mask is None:
-            self._found[prepared.frame.index] = prepared.segmentation.mask
+            self._found[prepared.frame.index] = zlib.compress(np.packbits(prepared.segmentation.mask).tobytes(), 1)
 
     def _cut_out(self) -> Iterator[Step]:
         """Leave what is beside the object out of the views of a moving camera; yield the steps of their frames."""
         views = {frame: view for frame, view in self.state.views.items() if frame in self._found}
         if not views:
             return
+
+        def found(frame: int) -> BoolArray:
+            shape, bits = views[frame].frame.depth_m.shape, np.frombuffer(zlib.decompress(self._found[frame]), np.uint8)
+            return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).astype(np.bool_)
+
+        most = Majority(views, found, self.state.solution.trajectory, self.scene.reach_m * CELL)
+        cut = {frame: self._cut(view, most) for frame, view in views.items()}
+        own = {frame: one.view for frame, one in cut.items() if one.view is not None}
+        newest = self.state.newest
+        if newest is not None:
+            newest = cut.get(newest.frame.index, newest)
+        self.state = self._solved = replace(self.state, views={**self.state.views, **own}, ready={}, newest=newest)
         self._remasked_views |= {*views}
-        masks = by_most(views, self._found, self.state.solution.trajectory, self.scene.reach_m * CELL)
-        sure, cut = agreeing(masks, self._found), dict(self.state.views)
-        for frame, view in views.items():
-            label = self.records[frame].mask
-            if Outcome(label) is not Outcome.CUT_OFF:
-                label = (Outcome.CONVERGED if sure else Outcome.UNSURE_MASK).label
-            one = remasked(segmented(view, label), masks[frame], self.modeler.sensor)
-            if one.view is None:  # all of it stays, and is judged
-                one = segmented(view, Outcome.UNSURE_MASK.label)
-            assert one.view is not None
-            cut[frame] = self.state.store.keep(one.view)
-            if (newest := self.state.newest) is not None and newest.frame.index == frame:
-                self.state = replace(self.state, newest=replace(one, view=cut[frame]))
-            self.state = self._solved = replace(self.state, views={**cut}, ready={})
-            yield self._once_more(replace(one, view=cut[frame]))
+        for one in cut.values():
+            yield self._once_more(one)
+
+    def _cut(self, view: RayImage, most: Majority) -> Prepared:
+        """Return a frame of a moving camera with the object alone in its view; all stays if most see none there."""
+        label = self.records[view.index].mask
+        if Outcome(label) is not Outcome.CUT_OFF:
+            label = (Outcome.CONVERGED if most.sure else Outcome.UNSURE_MASK).label
+        one = remasked(segmented(view, label), most.mask(view.index), self.modeler.sensor)
+        one = segmented(view, Outcome.UNSURE_MASK.label) if one.view is None else one
+        return one if one.view is None else replace(one, view=self.state.store.keep(one.view))
 
     def _again(self, view: RayImage) -> Prepared:
         """Return a frame of the model as it was segmented."""

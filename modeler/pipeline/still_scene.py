@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -18,53 +20,64 @@ CELL: Final = 0.02
 _CELLS: Final = 2**20  # along each axis, of which a scene fills a hundred
 _SURER: Final = 0.25  # by which the other views have to be surer than the view itself: cubes at a rim hold both
 
+Cubes = npt.NDArray[np.int64]
 
-def by_most(
-    views: Mapping[int, RayImage], found: Mapping[int, BoolArray], trajectory: Mapping[int, Array], cell_m: float
-) -> dict[int, BoolArray]:
-    """Return the object's masks (h, w) in views of a scene that is still, by frame number: as most other views have it.
 
-    Args:
-        views: with masks of the object and of what is beside it.
-        found: masks of what each view alone takes for the object.
-        trajectory: object_from_camera (4, 4) by frame number.
-        cell_m: side of the cubes in which views are compared.
-    """
+@dataclass(frozen=True, eq=False)
+class Majority:
+    """What most views of a scene that is still take for the object."""
 
-    def looked_at(frame: int) -> tuple[BoolArray, npt.NDArray[np.int64]]:
-        """Return which pixels (h, w) a view compares, and the numbers (n,) of the cubes in which they lie."""
-        images = views[frame].frame
-        seen: BoolArray = np.asarray(images.mask) & (images.depth_m > 0.0)
-        points_m = np.asarray(point_image(images.depth_m, images.camera)[seen], dtype=np.float64)
-        x, y, z = np.floor(se3.transform(trajectory[frame], points_m) / cell_m).astype(np.int64).T + _CELLS // 2
-        return seen, (x * _CELLS + y) * _CELLS + z
+    views: Mapping[int, RayImage]
+    """By frame number, with masks of the object and of what is beside it."""
+    found: Callable[[int], BoolArray]
+    """Returns the mask (h, w) of what a view alone takes for the object."""
+    trajectory: Mapping[int, Array]
+    """object_from_camera (4, 4) by frame number."""
+    cell_m: float
+    """Side of the cubes in which views are compared."""
 
-    votes = {}
-    for frame in spread([*views], MAX_VIEWS):
-        seen, cubes = looked_at(frame)
-        own, which = np.unique(cubes, return_inverse=True)
-        votes[frame] = own, np.bincount(which, found[frame][seen]) / np.bincount(which)
-    known, which = np.unique(np.concatenate([cubes for cubes, _ in votes.values()]), return_inverse=True)
-    yes, looks, masks = (
-        np.bincount(which, np.concatenate([share for _, share in votes.values()])),
-        np.bincount(which),
-        {},
-    )
-    for frame in views:
-        seen, cubes = looked_at(frame)
-        place, own = np.minimum(np.searchsorted(known, cubes), len(known) - 1), found[frame][seen]
+    def mask(self, frame: int) -> BoolArray:
+        """Return the object's mask (h, w) in a view, as most of the others have it."""
+        (known, yes, looks), (seen, cubes) = self._summed, self._cubes(frame)
+        place, own = np.minimum(np.searchsorted(known, cubes), len(known) - 1), self.found(frame)[seen]
         for_it, others = yes[place], np.where(known[place] == cubes, looks[place], 0)
-        if frame in votes:  # the others decide
-            for_it, others = for_it - votes[frame][1][np.searchsorted(votes[frame][0], cubes)], others - 1
+        if frame in self._votes:  # the others decide
+            voted, share = self._votes[frame]
+            for_it, others = for_it - share[np.searchsorted(voted, cubes)], others - 1
         share = np.divide(for_it, others, out=own.astype(np.float64), where=others > 0)
         mask = np.zeros_like(seen)
         mask[seen] = share > np.where(own, 0.5 - _SURER, 0.5 + _SURER)
-        masks[frame] = without_specks(mask)
-    return masks
+        return without_specks(mask)
 
+    @cached_property
+    def sure(self) -> bool:
+        """Whether at least half of the masks are about what was found in their views alone."""
+        pairs = [(self.mask(frame), self.found(frame)) for frame in self._votes]
+        alike = [2 * int(np.sum(mask & found)) > int(np.sum(mask | found)) for mask, found in pairs]
+        return bool(2 * sum(alike) >= len(alike))
 
-def agreeing(masks: Mapping[int, BoolArray], found: Mapping[int, BoolArray]) -> bool:
-    """Return whether at least half of the masks are about what was found in their views alone."""
-    pairs = [(mask, found[frame]) for frame, mask in masks.items()]
-    alike = [2 * int(np.sum(mask & other)) > int(np.sum(mask | other)) for mask, other in pairs]
-    return bool(2 * sum(alike) >= len(alike))
+    @cached_property
+    def _votes(self) -> dict[int, tuple[Cubes, Array]]:
+        """Cubes that some of the views see, and the share of each that a view takes for the object."""
+        votes = {}
+        for frame in spread([*self.views], MAX_VIEWS):
+            seen, cubes = self._cubes(frame)
+            own, which = np.unique(cubes, return_inverse=True)
+            votes[frame] = own, np.bincount(which, self.found(frame)[seen]) / np.bincount(which)
+        return votes
+
+    @cached_property
+    def _summed(self) -> tuple[Cubes, Array, npt.NDArray[np.int64]]:
+        """Cubes (n,) that any of them sees, the sum of their shares, and how many see it."""
+        known, which = np.unique(np.concatenate([cubes for cubes, _ in self._votes.values()]), return_inverse=True)
+        shares = np.concatenate([share for _, share in self._votes.values()])
+        return known, np.asarray(np.bincount(which, shares), dtype=np.float64), np.bincount(which)
+
+    def _cubes(self, frame: int) -> tuple[BoolArray, Cubes]:
+        """Return which pixels (h, w) a view compares, and the numbers (n,) of the cubes in which they lie."""
+        images = self.views[frame].frame
+        seen: BoolArray = np.asarray(images.mask) & (images.depth_m > 0.0)
+        points_m = np.asarray(point_image(images.depth_m, images.camera)[seen], dtype=np.float64)
+        places = np.floor(se3.transform(self.trajectory[frame], points_m) / self.cell_m).astype(np.int64)
+        x, y, z = places.T + _CELLS // 2
+        return seen, (x * _CELLS + y) * _CELLS + z

@@ -164,9 +164,11 @@ class Segmenter:
 
         It determines the camera's motion where the object is nearly round, hardly seen, or not found.
         """
-        depth_m = self._kept(frame)
-        known = np.isfinite(depth_m)
-        if frame.mask is not None or scene.reach_m == 0.0 or not known.any():
+        if frame.mask is not None or scene.reach_m == 0.0:
+            return found
+        frame = _interpolated(frame)
+        known = np.isfinite(self._kept(frame))
+        if not known.any():
             return found
         points, mask = _points(frame), found.mask & known
         if not mask.any():  # what stands at the middle of the image
