@@ -98,8 +98,8 @@ class Scene:
         """What may be wrong with the capture, in words."""
         if self.camera_moves:
             return (
-                "the camera seems to move: what stands at the middle of each image is taken for the object; "
-                "give masks, `roi` or `max_depth_m` where that is something else",
+                "the camera seems to move: what stands at the middle of each image is taken for the object, which lies "
+                "still; give masks, `roi` or `max_depth_m` where that is something else",
             )
         if self.leads_out and self.plane is None:
             return ("what moves leads out of the image, and nothing carries it: give masks if a hand holds it",)

@@ -104,7 +104,7 @@ class Capture:
         if self._too_far:
             found.append(self._too_far)
         if self._scene.camera_moves:
-            found.append("the camera seems to move; keep it still")
+            found.append("the camera seems to move; keep it still, or the object")
         if self._scene.arms:
             found.append("an arm is in view; take it out of the image before each frame")
         return [*found, *([self.fault] if self.fault else [])]
