@@ -129,7 +129,7 @@ def test_a_viewer_that_freezes_does_not_stop_the_run(
     run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("modeler.viz.stream._PATIENCE_S", 0.5)
-    monkeypatch.setattr("modeler.viz.viewer._STOP_S", 0.2)
+    monkeypatch.setattr("modeler.viz.viewer.STOP_S", 0.2)
     stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     stream(run[0])
     stream.viewers[0].process.send_signal(signal.SIGSTOP)
@@ -196,7 +196,7 @@ def test_a_signal_while_a_silent_viewer_is_waited_for_ends_the_process(tmp_path:
 def test_a_viewer_that_is_far_behind_is_left_out(caplog: pytest.LogCaptureFixture, monkeypatch: Any) -> None:
     released, unregistered = threading.Event(), threading.Event()
     monkeypatch.setattr("rerun.unregister_shutdown", unregistered.set)
-    monkeypatch.setattr("modeler.viz.stream._STOP_S", 0.2)
+    monkeypatch.setattr("modeler.viz.viewer.STOP_S", 0.2)
     recording: Any = SimpleNamespace(disconnect=lambda: None)
     shown, begun = Shown(recording), threading.Event()
     shown.put(lambda _: (begun.set(), released.wait()))
