@@ -243,6 +243,8 @@ class RunFolder:
         contents[_REPORT] = json.dumps(report, allow_nan=False) + "\n"
         for name, content in contents.items():
             write_atomically(self.path / name, content, lasting=step.last)
+        if step.last and MASKS not in contents:  # those of the run before, if it is resumed with more frames
+            (self.path / MASKS).unlink(missing_ok=True)
         if not step.last:
             settle_soon(*(self.path / name for name in contents), self.path)
         self.pace.took(time.monotonic() - began_s)
@@ -261,7 +263,7 @@ class RunFolder:
         try:
             with np.load(path, allow_pickle=False) as masks:
                 return {int(frame): np.asarray(masks[frame], dtype=np.bool_) for frame in masks}
-        except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+        except (OSError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error, EOFError) as error:
             raise InputError(f"{path}: cannot be read ({error}); build the run again") from error
 
     def finish(self) -> None:

@@ -82,7 +82,7 @@ class Run:
     def __post_init__(self) -> None:
         """Start with an empty preview."""
         self._preview = Preview(self.modeler.fuser)
-        self._remasked_views: set[int] = set()
+        self._with_other_masks: set[int] = set()  # views with masks that their frames alone do not show
         self._found: dict[int, bytes] = {}  # masks of the object, where views show what is beside it as well
         self._solved: State | None = None
 
@@ -102,7 +102,7 @@ class Run:
             for prepared, last in ((one, False) for one in coming) if live else with_last(coming):
                 found = prepared()
                 self.state = self.state.read(found)
-                self._note(found)
+                self._keep_mask(found)
                 placed = yield from self._placed(self.state, found, self.state.latest, last=last)
                 yield self._after(placed)
 
@@ -119,7 +119,7 @@ class Run:
             for preparation, _ in with_last(map(preparing, frames)):  # reads one ahead, which is prepared meanwhile
                 prepared = preparation()
                 self.state = self.state.inserted(prepared)
-                self._note(prepared)
+                self._keep_mask(prepared)
                 nearest = self.state.map_view.nearest_in_time(prepared.frame.index)
                 first = nearest[0] if nearest else None
                 placed = yield from self._placed(self.state, prepared, first, "fill")
@@ -207,7 +207,7 @@ class Run:
             model = widened(model, self.state.solution)
         newest, spans = self.state.newest or newest, self.state.spans
         last = self._step(newest, [edge.posterior for edge in spans], spans)
-        last = replace(last, last=True, make_model=lambda: model, remasked=self._remasked_views & {*self.state.views})
+        last = replace(last, last=True, make_model=lambda: model, remasked=self._with_other_masks & {*self.state.views})
         verdict = judged(
             last,
             interrupted=interrupted,
@@ -286,7 +286,7 @@ class Run:
                 break
         if kept is not self:
             self.records.update(kept.records)
-            self._remasked_views |= {*kept.state.views}
+            self._with_other_masks |= {*kept.state.views}
             shown = self.state.newest is None or self.state.newest.view is not None
             found = kept.state if shown else replace(kept.state, newest=self.state.newest)
             self.state = self._solved = found
@@ -300,7 +300,7 @@ class Run:
         edges = [edge for edge in self.state.graph.edges if edge.source == number and edge.kind != "span"]
         return self._step(prepared, [edge.posterior for edge in edges], edges)
 
-    def _note(self, prepared: Prepared) -> None:
+    def _keep_mask(self, prepared: Prepared) -> None:
         """Keep the object's mask where the view has what is beside it as well."""
         if self.scene.reach_m > 0.0 and prepared.view is not None and prepared.frame.mask is None:
             self._found[prepared.frame.index] = zlib.compress(np.packbits(prepared.segmentation.mask).tobytes(), 1)
@@ -322,18 +322,19 @@ class Run:
         if newest is not None:
             newest = cut.get(newest.frame.index, newest)
         self.state = self._solved = replace(self.state, views={**self.state.views, **own}, ready={}, newest=newest)
-        self._remasked_views |= {*views}
+        self._with_other_masks |= {*views}
         for one in cut.values():
             yield self._once_more(one)
 
     def _cut(self, view: RayImage, most: Majority) -> Prepared:
         """Return a frame of a moving camera with the object alone in its view; all stays if most see none there."""
+        own = self.modeler.sensor.ray_image(replace(view.frame, mask=most.mask(view.index)), view.plane)
+        if not len(own.points_m):
+            return segmented(view, Outcome.UNSURE_MASK.label)
         label = self.records[view.index].mask
         if Outcome(label) is not Outcome.CUT_OFF:
             label = (Outcome.CONVERGED if most.sure else Outcome.UNSURE_MASK).label
-        one = remasked(segmented(view, label), most.mask(view.index), self.modeler.sensor)
-        one = segmented(view, Outcome.UNSURE_MASK.label) if one.view is None else one
-        return one if one.view is None else replace(one, view=self.state.store.keep(one.view))
+        return segmented(self.state.store.keep(own), label)
 
     def _again(self, view: RayImage) -> Prepared:
         """Return a frame of the model as it was segmented."""

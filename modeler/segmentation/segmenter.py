@@ -290,9 +290,9 @@ def _measured(frame: Frame) -> Float32Array:
 def _radius_m(frame: Frame, mask: BoolArray) -> float:
     """Return the distance in m from the middle of a mask's points within which nearly all of them are."""
     points = _points(frame)[mask & (frame.depth_m > 0.0)]
-    return (
-        float(np.percentile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 98.0)) if len(points) else 0.0
-    )
+    if not len(points):
+        return 0.0
+    return float(np.percentile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 98.0))
 
 
 def _points(frame: Frame, stride: int = 1) -> Float32Array:

@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for number in range(options.captures)
         if options.only is None or number in options.only
     ]
-    path = options.out / f"{options.half}{', led round' if options.led_round else ''}.jsonl"
+    path = options.out / f"{options.half}{'-led-round' if options.led_round else ''}.jsonl"
     done = earlier(path)
     missing = [plan for plan in plans if plan.number not in done]
     drawn = {"drawn": led_round} if options.led_round else {}
