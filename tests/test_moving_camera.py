@@ -83,3 +83,18 @@ def test_masks_are_those_of_most_views():
     assert most.sure
     other = {0: true, 1: true, 2: wrong, 3: wrong.T[:48, :48].repeat(2, axis=1)[:, :64], 4: ~true & ~wrong}
     assert not Majority(views, other.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01).sure
+
+
+def test_a_thing_that_few_views_take_for_the_object_is_no_part_of_it():
+    camera, rng = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), np.random.default_rng(0)
+    depth_m = np.full((48, 64), 0.5, np.float32) + rng.normal(0.0, 1e-4, (48, 64)).astype(np.float32)
+    true, wrong = np.zeros((2, 48, 64), dtype=np.bool_)
+    true[15:30, 20:40], wrong[5:12, 45:60] = True, True
+    everything = np.ones_like(true)
+    seen = [everything & ~wrong, everything & ~wrong, everything & ~wrong, everything, everything]  # who alone sees it
+    views = {k: Sensor().ray_image(Frame(k, float(k), depth_m, camera, mask)) for k, mask in enumerate(seen)}
+    found = [true, true, true, wrong, wrong]
+    most = Majority(views, found.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01)
+    for frame in views:
+        assert not (most.mask(frame) & wrong).any()
+        assert iou(most.mask(frame), true) > 0.9

@@ -9,6 +9,9 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.pipeline.joining import MAX_VIEWS
@@ -23,6 +26,8 @@ common.
 """
 _CELLS: Final = 2**20  # along each axis, of which a scene fills a hundred
 _SURER: Final = 0.25  # by which the other views have to be surer than the view itself: cubes at a rim hold both
+
+_APART: Final = 2.5  # cubes, a seventh of the object's radius, between parts of one thing
 
 Cubes = npt.NDArray[np.int64]
 
@@ -49,8 +54,12 @@ class Majority:
             voted, share = self._votes[frame]
             for_it, others = for_it - share[np.searchsorted(voted, cubes)], others - 1
         share = np.divide(for_it, others, out=own.astype(np.float64), where=others > 0)
+        elsewhere = self._elsewhere[place] & (known[place] == cubes)
+        share[elsewhere] = 0.0
+        # A view that takes another thing for the object does not count at all.
+        surer = 0.0 if 2 * np.count_nonzero(own & elsewhere) > np.count_nonzero(own) else _SURER
         mask = np.zeros_like(seen)
-        mask[seen] = share > np.where(own, 0.5 - _SURER, 0.5 + _SURER)
+        mask[seen] = share > np.where(own, 0.5 - surer, 0.5 + surer)
         return without_specks(mask)
 
     @cached_property
@@ -76,6 +85,28 @@ class Majority:
         known, which = np.unique(np.concatenate([cubes for cubes, _ in self._votes.values()]), return_inverse=True)
         shares = np.concatenate([share for _, share in self._votes.values()])
         return known, np.asarray(np.bincount(which, shares), dtype=np.float64), np.bincount(which)
+
+    @cached_property
+    def _elsewhere(self) -> BoolArray:
+        """Which of the cubes (n,) are not at the thing that most of the views take for the object."""
+        known, yes, looks = self._summed
+        places, own = (
+            np.stack([known // _CELLS**2, known // _CELLS % _CELLS, known % _CELLS], axis=1),
+            2.0 * yes > looks,
+        )
+        if not own.any():
+            return own
+        near = KDTree(places[own]).query_pairs(_APART, output_type="ndarray")
+        size = (int(np.count_nonzero(own)),) * 2
+        things = np.full(len(known), -1)
+        count, things[own] = connected_components(coo_matrix((np.ones(len(near)), near.T), size), directed=False)
+        taken = np.zeros(count)
+        for cubes, share in self._votes.values():
+            found = things[np.searchsorted(known, cubes[share > 0.5])]
+            if (found >= 0).any():
+                taken[np.bincount(found[found >= 0]).argmax()] += 1.0
+        away, _ = KDTree(places[things == taken.argmax()]).query(places, distance_upper_bound=_APART)
+        return np.asarray(np.isinf(away), dtype=np.bool_)
 
     def _cubes(self, frame: int) -> tuple[BoolArray, Cubes]:
         """Return which pixels (h, w) a view compares, and the numbers (n,) of the cubes in which they lie."""
