@@ -13,7 +13,7 @@ from modeler.pipeline.still_scene import Majority
 from modeler.runs.joining import edit
 from modeler.runs.reopening import reopened
 from modeler.segmentation import Segmenter
-from modeler.types import Camera, Frame, Outcome
+from modeler.types import Camera, Frame, Outcome, Step
 from modeler.views import Sensor
 
 
@@ -68,6 +68,24 @@ def test_a_model_is_of_the_object_alone_and_stays_so_when_its_run_is_opened_agai
     (tmp_path / "fewer" / "masks.npz").write_bytes(b"no archive")
     with pytest.raises(modeler.InputError, match=r"masks\.npz: cannot be read"):
         reopened(tmp_path / "fewer")
+
+
+def test_masks_that_most_frames_are_unsure_of_stay_unsure(going_round, monkeypatch):
+    frames, _ = going_round
+    segment = Segmenter.segment
+    scene = Segmenter().scene(frames)
+    for few in (range(2), range(6)):
+        monkeypatch.setattr(
+            Segmenter,
+            "segment",
+            lambda self, frame, scene, few=few: replace(
+                segment(self, frame, scene), outcome=Outcome.UNSURE_MASK if frame.index in few else Outcome.CONVERGED
+            ),
+        )
+        *_, last = modeler.Modeler().run(frames, scene)
+        assert isinstance(last, Step)
+        assert last.verdict is not None
+        assert ("unsure_masks" in [fault.code for fault in last.verdict.shortcomings]) == (len(few) > 4)
 
 
 def test_masks_are_those_of_most_views():

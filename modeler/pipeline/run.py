@@ -316,7 +316,9 @@ class Run:
             return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).astype(np.bool_)
 
         most = Majority(views, found, self.state.solution.trajectory, self.scene.reach_m * CELL)
-        cut = {frame: self._cut(view, most) for frame, view in views.items()}
+        alone = [self.records[frame].mask for frame in views]
+        sure = most.sure and 2 * alone.count(Outcome.UNSURE_MASK.label) <= len(alone)  # the others vote on a minority
+        cut = {frame: self._cut(view, most, sure=sure) for frame, view in views.items()}
         own = {frame: one.view for frame, one in cut.items() if one.view is not None}
         newest = self.state.newest
         if newest is not None:
@@ -326,14 +328,14 @@ class Run:
         for one in cut.values():
             yield self._once_more(one)
 
-    def _cut(self, view: RayImage, most: Majority) -> Prepared:
+    def _cut(self, view: RayImage, most: Majority, *, sure: bool) -> Prepared:
         """Return a frame of a moving camera with the object alone in its view; all stays if most see none there."""
         own = self.modeler.sensor.ray_image(replace(view.frame, mask=most.mask(view.index)), view.plane)
         if not len(own.points_m):
             return segmented(view, Outcome.UNSURE_MASK.label)
         label = self.records[view.index].mask
         if Outcome(label) is not Outcome.CUT_OFF:
-            label = (Outcome.CONVERGED if most.sure else Outcome.UNSURE_MASK).label
+            label = (Outcome.CONVERGED if sure else Outcome.UNSURE_MASK).label
         return segmented(self.state.store.keep(own), label)
 
     def _again(self, view: RayImage) -> Prepared:

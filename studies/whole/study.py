@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, final
@@ -27,6 +27,8 @@ from studies.whole.things import Thing, read
 _ALIKE: Final = 0.002
 """Mean distance, as a share of the size, within which a turned mesh is the same: a fifth of what the finest captures
 resolve."""
+_LEAST: Final = 0.5
+"""Share of masks that is the object, and of the object in masks: with less, another thing is modelled, or a part."""
 _POINTS: Final = 300
 """Of a view that are compared: errors of the surface are then known to a few per cent."""
 
@@ -62,11 +64,17 @@ class Outcome:
     """Largest error of a view's surface (rms) after alignment by a similarity; None likewise."""
     seconds: float
     """Wall time of the run without rendering."""
+    of_object: float | None = None
+    """Share of the measured pixels of masks that show the object, median over views; None unless the camera moves."""
+    complete: float | None = None
+    """Share of the object's measured pixels that are in the masks, likewise."""
 
     @property
     def right(self) -> bool:
-        """Whether the model is right to its tolerance."""
+        """Whether the model is right to its tolerance, and of the object."""
         if self.error_deg is None or self.error_m is None:
+            return False
+        if self.of_object is not None and self.complete is not None and min(self.of_object, self.complete) < _LEAST:
             return False
         return self.error_deg <= MAX_DEG and self.error_m <= self.tolerance_m
 
@@ -132,7 +140,22 @@ def outcome(
         error_deg=error_deg,
         error_m=error_m,
         seconds=seconds,
+        **_shares(capture, step),
     )
+
+
+def _shares(capture: Capture, step: Step | None) -> dict[str, float]:
+    """Return how much of masks is the object, and how much of the object is in masks, if the camera is led round."""
+    if step is None or not capture.factors.led_round or not step.views:
+        return {}
+    exact, found = replace(capture, factors=replace(capture.factors, masks="exact")), []
+    for index, view in step.views.items():
+        measured = np.nan_to_num(view.frame.depth_m) > 0.0
+        own, true = (np.asarray(mask) & measured for mask in (view.frame.mask, exact.frame(index).mask))
+        both = np.count_nonzero(own & true)
+        found.append((both / max(np.count_nonzero(own), 1), both / max(np.count_nonzero(true), 1)))
+    of_object, complete = np.median(found, axis=0).tolist()
+    return {"of_object": of_object, "complete": complete}
 
 
 @cache
