@@ -23,7 +23,7 @@ class Table:
     command: tuple[str, ...]
     """Lines for a shell that measure the figures; none if the page has them, or no command measures them any more."""
     commit: str
-    """Short hash of the commit that was measured; `earlier`, or NOT_KNOWN, where no hash was noted."""
+    """Short hash of the commit that was measured, or NOT_KNOWN where none was noted; then those of single rows."""
     columns: tuple[str, ...]
     """Titles, in Markdown."""
     rows: tuple[tuple[str | float, ...], ...]
@@ -36,7 +36,7 @@ class Table:
         parts = ["```sh\n" + "\n".join(self.command) + "\n```"] if self.command else []
         parts.append(markdown(self.columns, self.rows))
         if self.commit != NOT_KNOWN:
-            parts.append(f"*Commit: {self.commit}.*")
+            parts.append(f"*Commit: {self.commit.removeprefix(f'{NOT_KNOWN}; ')}.*")
         if self.note:
             parts.append("\n".join(f"- {item}" for item in self.note))
         return "\n\n".join(parts)
