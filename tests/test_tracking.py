@@ -233,6 +233,20 @@ def test_a_match_within_the_limits_gives_way_to_a_more_probable_one(
     assert converged_or(within, beyond) is (beyond if replaced else within)
 
 
+@pytest.mark.parametrize(
+    ("contradicted", "better_nats", "turned_deg", "beaten"),
+    [(True, 7.5, 120.0, True), (True, 6.5, 120.0, False), (False, 7.5, 120.0, False), (True, 7.5, 35.0, False)],
+)
+def test_a_contradicted_match_within_the_limits_is_none_if_another_is_far_more_probable(
+    contradicted: bool, better_nats: float, turned_deg: float, beaten: bool
+) -> None:
+    """Whichever of the two is right, the one within the limits is not."""
+    poses = [PoseGaussian(turned(deg), COVARIANCE) for deg in (25.0, turned_deg)]
+    within = Posterior(1, 0, poses[0], CONVERGED, 0.8, contradicted=contradicted, log_marginal_likelihood=-20.0)
+    beyond = Posterior(1, 0, poses[1], NO_OVERLAP, 0.7, contradicted=True, log_marginal_likelihood=-20.0 + better_nats)
+    assert converged_or(within, beyond).outcome is (AT_LIMIT if beaten else CONVERGED)
+
+
 # Frames in which something hides the object: what is spent on them, and that those after them join as ever.
 
 HIDDEN = frozenset({2, 3, 4, 5})

@@ -19,7 +19,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure import Closer
 from modeler.graph.focal import LIMIT_STEPS
-from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, converged_or
+from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, SEPARATE_RAD, converged_or
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
 from modeler.types import (
@@ -43,9 +43,8 @@ FULL: Final = 1.0
 """Effort of a registration that may become an edge."""
 
 _LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
-_UNEVEN_SHARE = 0.25  # of the way: standard deviation in the middle between two views, if the speed is uneven
 _MIN_OVERLAP_GAIN = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
-_SEPARATE_RAD = 0.26  # registrations that differ by a larger rotation are two modes
+_UNEVEN_SHARE = 0.25  # of the way: standard deviation in the middle between two views, if the speed is uneven
 _MIN_MODE_WEIGHT = 0.01
 
 
@@ -307,7 +306,7 @@ def unless_alike(within: Posterior, wider: Posterior, density: AbstractPoseDensi
         density: the prior density, with the limits.
     """
     if within.outcome is Outcome.AT_LIMIT and within.matches and wider.usable:
-        separate = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > _SEPARATE_RAD
+        separate = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > SEPARATE_RAD
         # Only for one mode: the mean of several may lie inside without being near any of them.
         inside = wider.outcome is Outcome.CONVERGED and _inside(density, wider.pose.mean[None])[0]
         better_nats = wider.log_marginal_likelihood - within.log_marginal_likelihood

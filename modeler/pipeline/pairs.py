@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from modeler import se3
 from modeler.segmentation import Scene, Segmenter
 from modeler.types import (
     AbstractPairCache,
@@ -31,6 +32,8 @@ BEYOND_LIMITS_NATS: Final = 7.0
 """Prior log odds of a motion within the prior's limits: one in a thousand exceeds them."""
 SEGMENTED: Final = (Outcome.CONVERGED, Outcome.UNSURE_MASK, Outcome.CUT_OFF)
 """Outcomes of a segmentation that has found an object."""
+SEPARATE_RAD: Final = 0.26
+"""Registrations that differ by a larger rotation are two modes."""
 _CONTRADICTED_NATS: Final = 4.6
 """Log odds against a match that the images contradict: they contradict one of 100 right ones (`Posterior`)."""
 
@@ -139,12 +142,19 @@ def converged_or(within: Posterior, unlimited: Posterior) -> Posterior:
 
     If several modes are found, none within the usual limits, none can be trusted. A match within the limits is only
     replaced if the other one's likelihood outweighs that motions beyond them are rare; images that contradict the
-    match speak against it as well.
+    match speak against it as well. If they contradict both, the less probable one is no match.
     """
+    better_nats = unlimited.log_marginal_likelihood - within.log_marginal_likelihood
     if unlimited.outcome is not Outcome.CONVERGED:
-        return within
+        return _beaten(within, unlimited) if within.contradicted and better_nats > BEYOND_LIMITS_NATS else within
     if not within.usable:
         return unlimited
     needed_nats = BEYOND_LIMITS_NATS - (_CONTRADICTED_NATS if within.contradicted else 0.0)
-    better_nats = unlimited.log_marginal_likelihood - within.log_marginal_likelihood
     return within if better_nats < needed_nats else unlimited
+
+
+def _beaten(within: Posterior, unlimited: Posterior) -> Posterior:
+    """Return a registration as one at the limits, if surface matches elsewhere without them."""
+    elsewhere = se3.rotation_angle(se3.inverse(within.pose.mean) @ unlimited.pose.mean) > SEPARATE_RAD
+    matches = unlimited.overlap >= unlimited.least_overlap
+    return replace(within, outcome=Outcome.AT_LIMIT) if within.usable and elsewhere and matches else within
