@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from modeler.segmentation import Segmenter
 from modeler.types import Camera, Frame
 
 CAMERA = Camera(width=240, height=180, fx=220.0, fy=220.0, cx=119.5, cy=89.5)
@@ -47,6 +48,23 @@ class World:
         depth[np.isinf(depth)] = np.nan
         image = (depth + rng.normal(0.0, sigma_m, len(depth))).reshape(w.shape).astype(np.float32)
         return Frame(index, float(index), image, CAMERA), (labels == OBJECT).reshape(w.shape)
+
+
+def filmed(count, rng, world_of, **noise):
+    """Return frames of the worlds of their numbers, and the object's true pixels (h, w) in each."""
+    views = [world_of(k).frame(k, rng, **noise) for k in range(count)]
+    return [frame for frame, _ in views], [mask for _, mask in views]
+
+
+def segmented(frames, **fields):
+    """Return what is found in frames whose scene is learned from all of them."""
+    segmenter = Segmenter(**fields)
+    scene = segmenter.scene(frames)
+    return [segmenter.segment(frame, scene) for frame in frames]
+
+
+def least_iou(found, masks):
+    return min(iou(one.mask, mask) for one, mask in zip(found, masks, strict=True))
 
 
 def iou(found, true):

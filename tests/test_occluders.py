@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bop_scenes import INDICES, META, random_frames
 from PIL import Image
-from segmentation_worlds import OBJECT, World, iou
+from segmentation_worlds import OBJECT, World, filmed, iou, least_iou, segmented
 from test_visibility import flashlight  # noqa: F401  a fixture
 
 from modeler import se3
@@ -123,63 +123,49 @@ def test_colours_beside_an_occluder_may_be_its_own(flashlight) -> None:  # noqa:
     assert (part.clearance[beside[beside >= 0]] < 0.3).all()
 
 
-def test_an_arm_that_comes_before_the_object_now_and_then_is_no_part_of_it() -> None:
+def standing(k: int) -> World:
+    """A box on a table, turned by 25° from frame to frame."""
+    return World().table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
+
+
+def test_an_arm_that_comes_before_the_object_now_and_then_is_no_part_of_it(rng) -> None:
     """While a person walks behind; nobody says where the arm is."""
-    frames, masks = [], []
-    for k in range(8):
-        world = World().table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
-        world.box((-0.4 + 0.05 * k, 0.35, 0.2), (0.06, 0.02, 0.2))
-        if k % 4 == 2:
-            world.box((0.2, -0.2, 0.1 + 0.01 * k), (0.19, 0.02, 0.02))
-        frame, mask = world.frame(k, np.random.default_rng(k))
-        frames.append(frame)
-        masks.append(mask)
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    for frame, mask in zip(frames, masks, strict=True):
-        assert iou(segmenter.segment(frame, scene).mask, mask) > 0.94
+
+    def world(k):
+        passed = standing(k).box((-0.4 + 0.05 * k, 0.35, 0.2), (0.06, 0.02, 0.2))
+        return passed.box((0.2, -0.2, 0.1 + 0.01 * k), (0.19, 0.02, 0.02)) if k % 4 == 2 else passed
+
+    frames, masks = filmed(8, rng, world)
+    assert least_iou(segmented(frames), masks) > 0.94
 
 
 def test_an_arm_in_every_frame_is_no_part_of_the_object(rng) -> None:
     """It reaches over the table and hides another part in every frame, some in two; nobody says where it is."""
+
+    def world(k):
+        return standing(k).box((0.17 + 0.01 * (k % 3), -0.12, arms_m[k]), (0.2, 0.02, 0.02))
+
     for lowest_m, highest_m in ((0.05, 0.09), (0.09, 0.11)):
-        frames, masks = [], []
-        for k, arm_m in enumerate(rng.uniform(lowest_m, highest_m, 8)):
-            world = World().table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
-            world.box((0.17 + 0.01 * (k % 3), -0.12, arm_m), (0.2, 0.02, 0.02))
-            frame, mask = world.frame(k, rng)
-            frames.append(frame)
-            masks.append(mask)
-        segmenter = Segmenter()
-        scene = segmenter.scene(frames)
-        found = [segmenter.segment(frame, scene) for frame in frames]
+        arms_m = rng.uniform(lowest_m, highest_m, 8)
+        frames, masks = filmed(8, rng, world)
+        found = segmented(frames)
         assert [one.outcome for one in found] == [Outcome.CONVERGED] * len(frames)
-        assert min(iou(one.mask, mask) for one, mask in zip(found, masks, strict=True)) > 0.9
+        assert least_iou(found, masks) > 0.9
 
 
 def test_a_frame_that_shows_only_an_arm_shows_no_object(rng) -> None:
-    frames = []
-    for k in range(8):
-        world = World().table()
-        if k != 3:
-            world.box((0.0, 0.0, 0.05), (0.05, 0.035, 0.05), turn_deg=25.0 * k, label=OBJECT)
-        world.box((0.17, -0.08, 0.05 + 0.01 * (k % 4)), (0.2, 0.02, 0.02))
-        frames.append(world.frame(k, rng)[0])
-    segmenter = Segmenter()
-    found = segmenter.segment(frames[3], segmenter.scene(frames))
-    assert found.outcome is not Outcome.CONVERGED
+    def world(k):
+        some = World().table().box((0.17, -0.08, 0.05 + 0.01 * (k % 4)), (0.2, 0.02, 0.02))
+        return some if k == 3 else some.box((0.0, 0.0, 0.05), (0.05, 0.035, 0.05), turn_deg=25.0 * k, label=OBJECT)
+
+    assert segmented(filmed(8, rng, world)[0])[3].outcome is not Outcome.CONVERGED
 
 
 def test_a_hand_that_touches_the_object_is_no_part_of_it_where_it_is_marked(rng) -> None:
-    frames, masks, hands = [], [], []
-    for k in range(6):
-        world = World().table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
-        world.box((0.13, 0.0, 0.12), (0.1, 0.02, 0.02), label=2)
-        frame, mask = world.frame(k, np.random.default_rng(k))
-        alone = World().box((0.13, 0.0, 0.12), (0.1, 0.02, 0.02), label=OBJECT).frame(k, np.random.default_rng(k))[1]
-        frames.append(replace(frame, occluder=alone & ~mask))
-        masks.append(mask)
-        hands.append(alone & ~mask)
+    seen, masks = filmed(6, rng, lambda k: standing(k).box((0.13, 0.0, 0.12), (0.1, 0.02, 0.02), label=2))
+    _, alone = filmed(6, rng, lambda k: World().box((0.13, 0.0, 0.12), (0.1, 0.02, 0.02), label=OBJECT))
+    hands = [hand & ~mask for hand, mask in zip(alone, masks, strict=True)]
+    frames = [replace(frame, occluder=hand) for frame, hand in zip(seen, hands, strict=True)]
     segmenter = Segmenter()
     scene = segmenter.scene(frames)
     for frame, mask, hand in zip(frames, masks, hands, strict=True):

@@ -9,7 +9,7 @@ import pytest
 from input_errors import refused
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from segmentation_worlds import CAMERA, OBJECT, World, iou
+from segmentation_worlds import CAMERA, OBJECT, World, filmed, iou, least_iou, segmented
 from slow_cases import quick_first
 
 from modeler.segmentation import DepthNoise, Scene, Segmenter
@@ -28,25 +28,19 @@ from modeler.types import Camera, Frame, Outcome
 
 def turned(count, rng, surround=lambda world, k: world, **camera):
     """Return frames and true masks of a box that turns by 25 degrees and shifts a little on a table."""
-    views = []
-    for k in range(count):
-        world = (
-            World(**camera)
-            .table()
-            .box((0.01 * (k % 3), -0.01 * (k % 2), 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
-        )
-        views.append(surround(world, k).frame(k, rng))
-    return [frame for frame, _ in views], [mask for _, mask in views]
+
+    def world(k):
+        place_m = (0.01 * (k % 3), -0.01 * (k % 2), 0.07)
+        return surround(World(**camera).table().box(place_m, (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT), k)
+
+    return filmed(count, rng, world)
 
 
 def judge(frames, masks, *, least=0.95, **fields):
     """Check that every frame is segmented well and surely, and return the segmentations."""
-    segmenter = Segmenter(**fields)
-    scene = segmenter.scene(frames)
-    found = [segmenter.segment(frame, scene) for frame in frames]
-    for one, mask in zip(found, masks, strict=True):
-        assert iou(one.mask, mask) > least
-        assert one.outcome is Outcome.CONVERGED
+    found = segmented(frames, **fields)
+    assert least_iou(found, masks) > least
+    assert {one.outcome for one in found} == {Outcome.CONVERGED}
     return found
 
 
@@ -71,8 +65,8 @@ def test_wall_clutter_and_a_passer_by_are_not_the_object(rng):
 
 def test_a_low_part_that_the_object_encloses_is_part_of_it(rng):
     """Like the brim of a hat."""
-    frames, masks = [], []
-    for k in range(6):
+
+    def hat(k):
         world = World().table()
         world.box((0.0, 0.0, 0.0025), (0.09, 0.09, 0.0025), turn_deg=25.0 * k, label=OBJECT)
         world.box((0.0, 0.0, 0.03), (0.03, 0.03, 0.03), turn_deg=25.0 * k, label=OBJECT)
@@ -82,62 +76,53 @@ def test_a_low_part_that_the_object_encloses_is_part_of_it(rng):
                 at = sign * np.array([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn), 0.0])
                 half_m = (half_x, half_y, 0.008)
                 world.box((at[0], at[1], 0.008), half_m, turn_deg=25.0 * k, label=OBJECT)
-        frame, mask = world.frame(k, rng, sigma_m=0.0004)
-        frames.append(frame)
-        masks.append(mask)
-    judge(frames, masks, least=0.96)
+        return world
+
+    judge(*filmed(6, rng, hat, sigma_m=0.0004), least=0.96)
 
 
 def test_what_stands_still_where_the_object_may_be_is_not_taken_for_it(rng):
-    frames, masks = [], []
-    for k in range(6):
-        world = World().table().box((0.1, -0.08, 0.06), (0.05, 0.05, 0.06))
-        along_m = -0.1 + 0.03 * k
-        world.box((along_m, along_m, 0.03), (0.03, 0.03, 0.03), turn_deg=25.0 * k, label=OBJECT)
-        frame, mask = world.frame(k, rng)
-        frames.append(frame)
-        masks.append(mask)
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    for frame, mask in zip(frames, masks, strict=True):
-        assert iou(segmenter.segment(frame, scene).mask, mask) > 0.95
+    def world(k):
+        place_m, still = (
+            (-0.1 + 0.03 * k, -0.1 + 0.03 * k, 0.03),
+            World().table().box((0.1, -0.08, 0.06), (0.05, 0.05, 0.06)),
+        )
+        return still.box(place_m, (0.03, 0.03, 0.03), turn_deg=25.0 * k, label=OBJECT)
+
+    frames, masks = filmed(6, rng, world)
+    assert least_iou(segmented(frames), masks) > 0.95
 
 
 def test_a_part_is_found_whose_connection_the_object_hides(rng):
     """Seen from before, the front of a dumbbell hides its bar, and its two ends are far apart in depth."""
-    frames, masks = [], []
-    for k in range(6):
+
+    def dumbbell(k):
         turn = np.radians(25.0 * k)
         away = 0.09 * np.array([np.sin(turn), -np.cos(turn), 0.0])
         world = World().table()
         for sign, half_m in ((1.0, 0.045), (-1.0, 0.05)):
             centre = sign * away + [0.0, 0.0, half_m]
             world.box(tuple(centre), (half_m, half_m, half_m), turn_deg=25.0 * k, label=OBJECT)
-        world.box((0.0, 0.0, 0.012), (0.008, 0.06, 0.01), turn_deg=25.0 * k, label=OBJECT)
-        frame, mask = world.frame(k, rng)
-        frames.append(frame)
-        masks.append(mask)
-    judge(frames, masks)
+        return world.box((0.0, 0.0, 0.012), (0.008, 0.06, 0.01), turn_deg=25.0 * k, label=OBJECT)
+
+    judge(*filmed(6, rng, dumbbell))
 
 
-def test_an_arm_that_touches_the_object_now_and_then_is_not_part_of_it(rng):
+@pytest.mark.parametrize(
+    ("half_m", "arm_m", "well"), [(0.035, -0.06, True), (0.07, -0.06, False), (0.07, -0.085, True)]
+)
+def test_an_arm_that_touches_the_object_now_and_then_is_not_part_of_it(rng, half_m, arm_m, well):
     """Where it is in front of the object, or most of what is there; if it is where the object may be, it is unsure."""
-    for half_m, arm_m, found_well in ((0.035, -0.06, True), (0.07, -0.06, False), (0.07, -0.085, True)):
-        frames, masks = [], []
-        for k in range(8):
-            world = World().table().box((0.0, 0.0, half_m), (half_m, 0.03, half_m), turn_deg=25.0 * k, label=OBJECT)
-            if k in (2, 5):
-                world.box((0.25, arm_m, 0.06), (0.24, 0.025, 0.025))
-            frame, mask = world.frame(k, rng)
-            frames.append(frame)
-            masks.append(mask)
-        segmenter = Segmenter()
-        scene = segmenter.scene(frames)
-        for k, (frame, mask) in enumerate(zip(frames, masks, strict=True)):
-            found = segmenter.segment(frame, scene)
-            right = iou(found.mask, mask) > 0.9
-            assert right or (k in (2, 5) and not found_well)
-            assert right or found.outcome is Outcome.UNSURE_MASK
+
+    def world(k):
+        alone = World().table().box((0.0, 0.0, half_m), (half_m, 0.03, half_m), turn_deg=25.0 * k, label=OBJECT)
+        return alone.box((0.25, arm_m, 0.06), (0.24, 0.025, 0.025)) if k in (2, 5) else alone
+
+    frames, masks = filmed(8, rng, world)
+    for k, (found, mask) in enumerate(zip(segmented(frames), masks, strict=True)):
+        right = iou(found.mask, mask) > 0.9
+        assert right or (k in (2, 5) and not well)
+        assert right or found.outcome is Outcome.UNSURE_MASK
 
 
 def test_who_walks_all_across_the_image_is_not_taken_for_a_moving_camera(rng):
@@ -146,10 +131,8 @@ def test_who_walks_all_across_the_image_is_not_taken_for_a_moving_camera(rng):
         return world.box((-0.6 + 0.17 * k, 0.25, 0.3), (0.16, 0.03, 0.6))
 
     frames, masks = turned(8, rng, surround, tilt_deg=5.0, distance_m=0.7)
-    scene = Segmenter().scene(frames)
-    assert scene.still
-    for frame, mask in zip(frames, masks, strict=True):
-        assert iou(Segmenter().segment(frame, scene).mask, mask) > 0.9
+    assert Segmenter().scene(frames).still
+    assert least_iou(segmented(frames), masks) > 0.9
 
 
 def test_a_board_behind_the_object_is_not_part_of_it(rng):
@@ -163,15 +146,12 @@ def test_a_board_behind_the_object_is_not_part_of_it(rng):
 
 
 def test_what_stands_on_a_turntable_does_not_include_the_turntable(rng):
-    frames, masks = [], []
-    for k in range(6):
+    def turning(k):
         world = World().table().box((0.0, 0.0, 0.045), (0.08, 0.08, 0.045)).box((0.0, 0.0, 0.095), (0.14, 0.14, 0.005))
-        world.box((0.0, 0.0, 0.15), (0.05, 0.03, 0.05), turn_deg=30.0 * k, label=OBJECT)
-        frame, mask = world.frame(k, rng)
-        frames.append(frame)
-        masks.append(mask)
+        return world.box((0.0, 0.0, 0.15), (0.05, 0.03, 0.05), turn_deg=30.0 * k, label=OBJECT)
+
     world = World()
-    for one in judge(frames, masks):
+    for one in judge(*filmed(6, rng, turning)):
         assert one.plane is not None
         plate = world.origin_m + 0.1 * world.camera_from_table[:, 2]
         assert abs(one.plane.height_m(plate[None])[0]) < 3.0 * one.plane.sigma_offset_m
@@ -189,11 +169,10 @@ def dish(world, turn_deg):
 
 @pytest.mark.parametrize("tilt_deg", [35.0, 50.0, 60.0])
 def test_the_floor_of_a_dish_is_neither_its_support_nor_a_wall(tilt_deg, rng):
-    worlds = [dish(World(tilt_deg=tilt_deg).table(), 25.0 * k) for k in range(6)]
-    shots = [world.frame(k, rng) for k, world in enumerate(worlds)]
-    for one in judge([frame for frame, _ in shots], [mask for _, mask in shots], least=0.9):
+    shots = filmed(6, rng, lambda k: dish(World(tilt_deg=tilt_deg).table(), 25.0 * k))
+    for one in judge(*shots, least=0.9):
         assert one.plane is not None
-        assert abs(one.plane.height_m(worlds[0].origin_m[None])[0]) < 3.0 * one.plane.sigma_offset_m
+        assert abs(one.plane.height_m(World().origin_m[None])[0]) < 3.0 * one.plane.sigma_offset_m
 
 
 def test_one_frame_is_enough_on_a_bare_table(rng):
@@ -208,30 +187,21 @@ def test_one_frame_is_enough_on_a_bare_table(rng):
 
 
 def test_a_moving_camera_is_noticed(rng):
-    views = [
-        World(tilt_deg=30.0 + 5.0 * k, turn_deg=30.0 * k)
-        .table()
-        .box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT)
-        for k in range(4)
-    ]
-    shots = [view.frame(k, rng) for k, view in enumerate(views)]
-    found = judge([frame for frame, _ in shots], [mask for _, mask in shots])
+    def world(k):
+        seen = World(tilt_deg=30.0 + 5.0 * k, turn_deg=30.0 * k).table()
+        return seen.box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT)
+
+    found = judge(*filmed(4, rng, world))
     assert found[0].plane is not None
     assert found[3].plane is not None
     assert np.arccos(found[0].plane.normal @ found[3].plane.normal) > np.radians(10.0)
 
 
 def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rng):
-    frames, masks = [], []
-    for k in range(12):
-        frame, mask = (
-            World()
-            .table()
-            .box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
-            .frame(k, rng, sigma_m=0.0032)
-        )
-        frames.append(frame)
-        masks.append(mask)
+    def world(k):
+        return World().table().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
+
+    frames, masks = filmed(12, rng, world, sigma_m=0.0032)
     segmenter = Segmenter()
     assert np.all(segmenter.noise.sigma_m(np.array([0.6, 0.9])) < 0.0015)
     scene = segmenter.scene(frames)
@@ -245,91 +215,79 @@ def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rn
 
 def turned_box(distance_m, half_m, rng):
     """Return eight frames of a box on a table, turned by 25° from each to the next, and its masks (h, w)."""
-    worlds = [World(distance_m=distance_m).table() for _ in range(8)]
-    views = [
-        world.box((0.0, 0.0, 0.1), half_m, turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
-        for k, world in enumerate(worlds)
-    ]
-    return [frame for frame, _ in views], [mask for _, mask in views]
+
+    def world(k):
+        return World(distance_m=distance_m).table().box((0.0, 0.0, 0.1), half_m, turn_deg=25.0 * k, label=OBJECT)
+
+    return filmed(8, rng, world)
 
 
 def test_a_near_object_that_fills_half_of_the_image_is_not_taken_for_a_moving_camera(rng):
     frames, masks = turned_box(0.45, (0.13, 0.1, 0.1), rng)
     assert np.mean([mask.mean() for mask in masks]) > 0.4
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
+    scene = Segmenter().scene(frames)
     assert not scene.camera_moves
     assert scene.plane is not None
-    for frame, mask in zip(frames, masks, strict=True):
-        assert iou(segmenter.segment(frame, scene).mask, mask) > 0.9
+    assert least_iou(segmented(frames), masks) > 0.9
 
 
 def test_an_object_that_the_image_cuts_off_in_all_frames_is_found_as_far_as_it_is_seen(rng):
     """Its own sides at the image's edge are no walls, nor is it an arm that something else would be left without."""
     frames, masks = turned_box(0.42, (0.12, 0.07, 0.1), rng)
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    assert not scene.arms
-    for frame, mask in zip(frames, masks, strict=True):
-        found = segmenter.segment(frame, scene)
-        assert iou(found.mask, mask) > 0.9
-        assert found.outcome is Outcome.CUT_OFF
+    found = segmented(frames)
+    assert not Segmenter().scene(frames).arms
+    assert least_iou(found, masks) > 0.9
+    assert {one.outcome for one in found} == {Outcome.CUT_OFF}
 
 
 @pytest.mark.parametrize("table", [False, True])
 def test_masks_are_asked_for_where_an_arm_may_be_part_of_the_object(rng, table):
-    frames = []
-    for k in range(8):
+    def held(k):
         world = World().table() if table else World().box((0.0, 0.6, 0.0), (2.0, 0.01, 2.0))
         world.box((0.0, 0.0, 0.14), (0.06, 0.04, 0.07), turn_deg=25.0 * k, label=OBJECT)
-        arm = world.box((0.27, 0.0, 0.14 + 0.01 * (k % 3)), (0.25, 0.03, 0.03))
-        frames.append(arm.frame(k, rng)[0])
-    doubts = Segmenter().scene(frames).doubts
+        return world.box((0.27, 0.0, 0.14 + 0.01 * (k % 3)), (0.25, 0.03, 0.03))
+
+    doubts = Segmenter().scene(filmed(8, rng, held)[0]).doubts
     assert any("give masks if a hand holds it" in doubt for doubt in doubts) is not table
 
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_wall_close_behind_a_hanging_object_is_not_its_support(rng, masked):
-    frames = []
-    for k in range(8):
-        world = World().box((0.0, 0.2, 0.0), (2.0, 0.01, 2.0))
-        frame, mask = world.box((0.0, 0.0, 0.0), (0.12, 0.07, 0.07), turn_deg=20.0 * k, label=OBJECT).frame(k, rng)
-        frames.append(replace(frame, mask=mask) if masked else frame)
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    assert all(segmenter.segment(frame, scene).plane is None for frame in frames)
+    def world(k):
+        wall = World().box((0.0, 0.2, 0.0), (2.0, 0.01, 2.0))
+        return wall.box((0.0, 0.0, 0.0), (0.12, 0.07, 0.07), turn_deg=20.0 * k, label=OBJECT)
+
+    frames, masks = filmed(8, rng, world)
+    given = [replace(frame, mask=mask if masked else None) for frame, mask in zip(frames, masks, strict=True)]
+    assert all(one.plane is None for one in segmented(given))
 
 
 def test_the_middle_of_a_hanging_object_that_turns_slowly_is_part_of_it(rng):
     """Depth changes there by less than its noise, and nothing carries the object."""
-    frames, masks = [], []
-    for k in range(8):
-        world = World().box((0.0, 0.6, 0.0), (2.0, 0.01, 2.0))
-        frame, mask = world.box((0.0, 0.0, 0.0), (0.12, 0.05, 0.07), turn_deg=3.0 * k, label=OBJECT).frame(k, rng)
-        frames.append(frame)
-        masks.append(mask)
-    for one in judge(frames, masks):
-        assert one.plane is None
+
+    def world(k):
+        wall = World().box((0.0, 0.6, 0.0), (2.0, 0.01, 2.0))
+        return wall.box((0.0, 0.0, 0.0), (0.12, 0.05, 0.07), turn_deg=3.0 * k, label=OBJECT)
+
+    assert all(one.plane is None for one in judge(*filmed(8, rng, world)))
 
 
 def test_a_small_object_that_turns_slowly_is_found_before_a_camera_of_little_noise(rng):
     """Depth changes by less than the usual noise; but frames show that there is less."""
-    frames, masks = [], []
-    for k in range(12):
-        world = World(tilt_deg=30.0, distance_m=0.15).table()
-        world = world.box((0.0, 0.0, 0.011), (0.006, 0.006, 0.011), turn_deg=5.0 * k, label=OBJECT)
-        frame, mask = world.frame(k, rng, sigma_m=5e-5)
-        frames.append(frame)
-        masks.append(mask)
-    judge(frames, masks, least=0.85)
+
+    def world(k):
+        table = World(tilt_deg=30.0, distance_m=0.15).table()
+        return table.box((0.0, 0.0, 0.011), (0.006, 0.006, 0.011), turn_deg=5.0 * k, label=OBJECT)
+
+    judge(*filmed(12, rng, world, sigma_m=5e-5), least=0.85)
 
 
 @pytest.mark.parametrize("step_deg", [1.0, 5.0, 30.0])
 def test_a_camera_that_goes_round_is_not_taken_for_noisy_depth(rng, step_deg):
-    frames = [
-        World(turn_deg=step_deg * k).table().box((0.05, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT).frame(k, rng)[0]
-        for k in range(12)
-    ]
+    def world(k):
+        return World(turn_deg=step_deg * k).table().box((0.05, 0.0, 0.07), (0.06, 0.035, 0.07), label=OBJECT)
+
+    frames, _ = filmed(12, rng, world)
     frames = [replace(frame, depth_m=frame.depth_m + np.float32(0.02 * k)) for k, frame in enumerate(frames)]
     scene = Segmenter().scene(frames)
     assert scene.camera_moves
@@ -338,16 +296,14 @@ def test_a_camera_that_goes_round_is_not_taken_for_noisy_depth(rng, step_deg):
     assert 0.5e-3 < scene.range_noise.pixel_sigma_inverse_per_m * 0.9**2 < 2e-3
 
 
-def island(k, rng, *, plate):
-    """Return a frame of a box on edge before nothing, on a plate that turns with it or not, and the true pixels."""
+def island(k):
+    """Return a box on edge before nothing."""
     world = World().box((0.0, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k, label=OBJECT)
-    world.box((0.07, 0.0, 0.03), (0.02, 0.02, 0.03), label=OBJECT)
-    return (world.box((0.0, 0.0, -0.01), (0.12, 0.12, 0.01)) if plate else world).frame(k, rng)
+    return world.box((0.07, 0.0, 0.03), (0.02, 0.02, 0.03), label=OBJECT)
 
 
 def test_what_stands_before_nothing_is_all_the_object(rng):
-    views = [island(k, rng, plate=False) for k in range(8)]
-    frames, masks = [frame for frame, _ in views], [mask for _, mask in views]
+    frames, masks = filmed(8, rng, island)
     for one in judge(frames, masks, least=0.9):
         assert one.plane is None
     segmenter = Segmenter()
@@ -361,10 +317,8 @@ def test_what_stands_before_nothing_is_all_the_object(rng):
 
 
 def test_a_plate_before_nothing_is_a_support(rng):
-    views = [island(k, rng, plate=True) for k in range(8)]
-    frames = [frame for frame, _ in views]
-    segmenter = Segmenter()
-    assert not segmenter.scene(frames).alone
+    frames, _ = filmed(8, rng, lambda k: island(k).box((0.0, 0.0, -0.01), (0.12, 0.12, 0.01)))
+    assert not Segmenter().scene(frames).alone
 
 
 def test_a_region_of_a_scene_is_no_island(rng):
@@ -445,15 +399,12 @@ def test_a_masked_object_before_nothing_has_no_plane(rng):
 
 
 def test_of_two_things_that_turn_neither_is_surely_the_object_but_a_region_helps(rng):
-    frames, masks = [], []
-    for k in range(5):
-        world = World().table().box((0.16, 0.0, 0.06), (0.05, 0.03, 0.06), turn_deg=20.0 * k)
-        frame, mask = world.box((-0.16, 0.0, 0.06), (0.05, 0.03, 0.06), turn_deg=25.0 * k, label=OBJECT).frame(k, rng)
-        frames.append(frame)
-        masks.append(mask)
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    assert all(segmenter.segment(frame, scene).outcome is Outcome.UNSURE_MASK for frame in frames)
+    def world(k):
+        other = World().table().box((0.16, 0.0, 0.06), (0.05, 0.03, 0.06), turn_deg=20.0 * k)
+        return other.box((-0.16, 0.0, 0.06), (0.05, 0.03, 0.06), turn_deg=25.0 * k, label=OBJECT)
+
+    frames, masks = filmed(5, rng, world)
+    assert {one.outcome for one in segmented(frames)} == {Outcome.UNSURE_MASK}
     for one in judge(frames, masks, roi=(0, 0, 120, 180)):
         assert not one.mask[:, 120:].any()
 
@@ -466,17 +417,12 @@ def test_beyond_the_greatest_depth_is_no_object(rng):
 
 def test_an_object_cut_off_by_the_image_is_named(rng):
     """It is modelled as far as it is seen; what the images contradict decides whether that is trusted."""
-    frames = [
-        World().table().box((0.42, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k).frame(k, rng)[0]
-        for k in range(4)
-    ]
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    found = [segmenter.segment(frame, scene) for frame in frames]
+    frames, _ = filmed(4, rng, lambda k: World().table().box((0.42, 0.0, 0.07), (0.06, 0.035, 0.07), turn_deg=25.0 * k))
+    found = segmented(frames)
     assert {each.outcome for each in found} == {Outcome.CUT_OFF}
     given = [replace(frame, mask=each.mask) for frame, each in zip(frames, found, strict=True)]
-    scene = segmenter.scene(given)
-    assert {segmenter.segment(frame, scene).outcome for frame in given} == {Outcome.CUT_OFF}
+    assert {each.outcome for each in segmented(given)} == {Outcome.CUT_OFF}
+    segmenter, scene = Segmenter(), Segmenter().scene(given)
     inside = [replace(frame, mask=frame.mask & (np.arange(frame.depth_m.shape[1]) < 230)) for frame in given]
     assert {segmenter.segment(frame, scene).outcome for frame in inside} == {Outcome.CONVERGED}
 
@@ -516,10 +462,7 @@ def test_hopeless_frames_have_an_outcome_and_no_exception(rng):
 
 def test_the_same_frames_give_the_same_masks(rng):
     frames, _ = turned(4, rng)
-    segmenter = Segmenter()
-    scenes = segmenter.scene(frames), segmenter.scene(frames)
-    one, two = ([segmenter.segment(frame, scene) for frame in frames] for scene in scenes)
-    for first, second in zip(one, two, strict=True):
+    for first, second in zip(segmented(frames), segmented(frames), strict=True):
         np.testing.assert_array_equal(first.mask, second.mask)
         assert first.plane is not None
         assert second.plane is not None
@@ -600,16 +543,12 @@ def bare(frames):
 
 def test_what_rises_over_the_end_of_its_table_is_sure(rng):
     """A table before nothing, in a part of the image: what is taller than its far end is not cut off."""
-    frames = [
-        World()
-        .box((0.0, 0.0, -0.01), (0.32, 0.2, 0.01))
-        .box((0.0, 0.05, 0.12), (0.05, 0.04, 0.12), turn_deg=20.0 * k)
-        .frame(k, rng)[0]
-        for k in range(5)
-    ]
-    segmenter = Segmenter()
-    scene = segmenter.scene(frames)
-    assert {segmenter.segment(frame, scene).outcome for frame in frames} == {Outcome.CONVERGED}
+
+    def world(k):
+        table = World().box((0.0, 0.0, -0.01), (0.32, 0.2, 0.01))
+        return table.box((0.0, 0.05, 0.12), (0.05, 0.04, 0.12), turn_deg=20.0 * k)
+
+    assert {one.outcome for one in segmented(filmed(5, rng, world)[0])} == {Outcome.CONVERGED}
 
 
 @pytest.mark.parametrize("name", ["box", "flashlight", "tube"])
