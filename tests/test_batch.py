@@ -22,11 +22,10 @@ from slow_cases import quick_first
 
 from modeler.batch import engines, jobs
 from modeler.batch.jobs import NOTES, Job, fingerprint, standing
-from modeler.batch.models import TABLE, models_in, write_models
+from modeler.batch.models import TABLE, models_in, read_table, write_models
 from modeler.cli import parsed
 from modeler.cli.batch import Batch
 from modeler.cli.manifest import Row, named, read_manifest
-from modeler.export.models_table import read_table
 from modeler.types import InputError
 from studies.kills.trials import SAME
 

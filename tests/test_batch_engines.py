@@ -17,8 +17,7 @@ import pytest
 from command_runner import QUICK
 from fake_builder import BOOK, book, sequence, started, wait_for
 
-from modeler.batch.models import TABLE
-from modeler.export.models_table import read_table
+from modeler.batch.models import TABLE, read_table
 
 HERE = Path(__file__).parent
 PAIRS, SEQUENCES = 6, 6

@@ -18,8 +18,7 @@ from command_runner import Run
 from PIL import Image
 
 from modeler.batch.jobs import NOTES
-from modeler.batch.models import THUMBNAIL_PX
-from modeler.export.models_table import enclosed_m3, read_table
+from modeler.batch.models import THUMBNAIL_PX, enclosed_m3, read_table
 from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.shapes import Box
 

@@ -1,17 +1,29 @@
-"""The models in the folder of a batch: records of single runs, and the list of all."""
+"""The models in the folder of a batch: records of single runs, and the list of all, a row a sequence, in Parquet."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
+import math
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
 
 from modeler.batch.jobs import NOTES, read_note
-from modeler.export import RunFolder, mesh_of, poses_of, read_model, write_atomically
-from modeler.export.models_table import finite, fits, model_columns, report_columns, write_table
-from modeler.types import Array, InputError
+from modeler.export import RunFolder, mesh_of, poses_of, read_model
+from modeler.export.files import write_atomically
+from modeler.export.placing import model_upright
+from modeler.system.regular_files import read_regular
+from modeler.types import ACCEPTED, Array, InputError, ObjectModel
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
 
 TABLE = "models.parquet"  # the list, in the folder of a batch
 THUMBNAIL_PX = 160  # side of a picture of a model
@@ -108,3 +120,156 @@ def _of_build(run: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
 def write_models(out: Path) -> None:
     """Write the list of the models in a folder."""
     write_table(out / TABLE, models_in(out))
+
+
+_COLUMNS = {
+    "name": "string",  # of the run folder
+    "sequence": "string",
+    "status": "int64",  # 0 trustworthy, 3 not; 2 and above: no model; null: not ended
+    "trustworthy": "bool",
+    "reasons": "list",  # why not
+    "failure": "string",  # message of the build, if there is no model
+    "tries": "int64",  # how often it has failed
+    "frames": "int64",
+    "accepted": "int64",
+    "closed": "bool",
+    "opening_deg": "double",  # of the loop, before the optimisation
+    "opening_m": "double",
+    "opening_sigmas": "double",
+    "rotation_error_deg": "double",  # largest over the frames, aligned at the first; where the truth is known
+    "translation_error_m": "double",
+    "width_m": "double",  # upright
+    "height_m": "double",
+    "depth_m": "double",
+    "volume_m3": "double",  # holes closed by flat fans
+    "triangles": "int64",
+    "surface_sigma_m": "double",  # median over the vertices that were seen
+    "pose_sigma_deg": "double",  # largest over the frames
+    "pose_sigma_m": "double",
+    "seconds": "double",
+    "prior": "string",
+    "seed": "int64",
+    "settings": "string",  # JSON
+    "versions": "string",  # JSON
+    "input": "string",  # digest of names and bytes
+}
+"""Columns and their types; all may be null."""
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows as a table; missing values are null."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    content = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist(list(rows), schema=_schema()), content)
+    write_atomically(path, content.getvalue())
+
+
+def fits(row: Mapping[str, Any]) -> bool:
+    """Return whether the values of a row are of the types of its columns."""
+    import pyarrow as pa
+
+    try:
+        pa.Table.from_pylist([dict(row)], schema=_schema())
+    except (pa.ArrowException, TypeError, ValueError, OverflowError):
+        return False
+    return True
+
+
+def read_table(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a table.
+
+    Raises:
+        InputError: if there is none, or it has not these columns.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(io.BytesIO(read_regular(path)))
+        return table.select(list(_COLUMNS)).cast(_schema()).to_pylist()
+    except (pa.ArrowException, KeyError) as error:
+        what = " ".join(str(error).split())
+        raise InputError(f"{path}: is not a list of models ({what}); run modeler batch again") from None
+
+
+def _schema() -> pa.Schema:
+    import pyarrow as pa
+
+    kinds = {"string": pa.string(), "int64": pa.int64(), "bool": pa.bool_(), "double": pa.float64()}
+    return pa.schema([(name, kinds.get(kind) or pa.list_(pa.string())) for name, kind in _COLUMNS.items()])
+
+
+def blank() -> dict[str, Any]:
+    """Return an empty row."""
+    return dict.fromkeys(_COLUMNS)
+
+
+def report_columns(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a report in the columns of the table."""
+    loop, evidence = report.get("loop") or {}, report.get("evidence") or {}
+    return {
+        "sequence": report["sequence"],
+        "trustworthy": report["trustworthy"],
+        "reasons": list(report["reasons"]),
+        "frames": len(report["frames"]),
+        "accepted": sum(frame["outcome"] == ACCEPTED for frame in report["frames"]),
+        "closed": report["closed"],
+        **{f"opening_{unit}": loop.get(f"opening_{unit}") for unit in ("deg", "m")},
+        "opening_sigmas": loop.get("sigmas"),
+        "pose_sigma_deg": (evidence.get("pose_sd_deg") or {}).get("value"),
+        "pose_sigma_m": (evidence.get("pose_sd_m") or {}).get("value"),
+        "seconds": report["seconds"].get("total"),
+        "prior": report.get("prior"),
+        "seed": report.get("seed"),
+    }
+
+
+def model_columns(model: ObjectModel, report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the measures of a model in the columns of the table."""
+    upright_m = model.vertices_m @ model_upright(report)  # right, down, forward
+    width_m, height_m, depth_m = (upright_m.max(axis=0) - upright_m.min(axis=0)).tolist()
+    sigmas_m = model.vertex_sigmas_m
+    known = None if sigmas_m is None else sigmas_m[np.isfinite(sigmas_m)]
+    return {
+        "width_m": width_m,
+        "height_m": height_m,
+        "depth_m": depth_m,
+        "volume_m3": enclosed_m3(model.vertices_m, model.triangles),
+        "triangles": len(model.triangles),
+        "surface_sigma_m": None if known is None or not len(known) else float(np.median(known)),
+    }
+
+
+def enclosed_m3(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> float:
+    """Return the volume in a mesh, each of its holes closed by a fan about the mean of its rim."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(vertices_m)
+    centred_m = vertices_m - vertices_m.mean(axis=0)
+    first, second, third = (centred_m[triangles[:, k]] for k in range(3))
+    volume = float(np.einsum("ij,ij->", first, np.cross(second, third)))
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    code, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    rim = edges[~np.isin(code, back)]
+    if not len(rim):
+        return volume / 6.0
+    corners, place = np.unique(rim, return_inverse=True)
+    place = place.reshape(-1, 2)
+    graph = coo_array((np.ones(len(rim)), (place[:, 0], place[:, 1])), shape=(len(corners), len(corners)))
+    loops, loop = connected_components(graph, directed=False)
+    sums = np.zeros((loops, 3))
+    np.add.at(sums, loop, centred_m[corners])
+    middle = sums / np.bincount(loop, minlength=loops)[:, None]
+    fan = np.cross(centred_m[rim[:, 1]], centred_m[rim[:, 0]])
+    volume += float(np.einsum("ij,ij->", middle[loop[place[:, 0]]], fan))
+    return volume / 6.0
+
+
+def finite(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values with None for numbers that are not finite, as JSON and tables have it."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
+    }

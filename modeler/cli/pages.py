@@ -111,8 +111,7 @@ class Gallery:
         from urllib.parse import quote
 
         from modeler.batch.jobs import NOTES
-        from modeler.batch.models import TABLE, closed_in, models_in, thumbnail_of
-        from modeler.export.models_table import blank, write_table
+        from modeler.batch.models import TABLE, blank, closed_in, models_in, thumbnail_of, write_table
         from modeler.runs.outputs import check_files
         from modeler.system.regular_files import read_regular
         from modeler.types import InputError

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 from nicegui import events, run, ui
 
-from modeler.studio.build_step import BuildStep
 from modeler.studio.capture import Capture
-from modeler.studio.capture_step import TONE, CaptureStep
-from modeler.studio.check_step import CheckStep, ExportStep
-from modeler.studio.files_step import FilesStep, ScansStep
+from modeler.studio.capture_steps import TONE, CaptureStep, FilesStep, ScansStep
 from modeler.studio.jobs import POLL_S, Job
+from modeler.studio.model_steps import BuildStep, CheckStep, ExportStep
 from modeler.studio.object_step import ObjectStep
 from modeler.studio.scan import Scan
 from modeler.studio.state import Studio

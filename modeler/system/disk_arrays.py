@@ -134,10 +134,6 @@ class ViewStore:
             depth_m=self._disk.written(frame.depth_m),
         )
 
-    def release(self) -> None:
-        """Drop from memory what was read of the views on disk; where it is used again, it is read again."""
-        self._disk.release()
-
 
 def _images(frame: Frame) -> list[npt.NDArray[np.generic]]:
     """Return the images of a frame."""

@@ -110,11 +110,6 @@ class Posterior:
         modes = tuple(replace(mode, pose=mode.pose.under(log_factor)) for mode in self.modes)
         return replace(self.without_samples(), pose=self.pose.under(log_factor), modes=modes)
 
-    def widened(self, sigma_focal: float) -> Posterior:
-        """Return the posterior of a single pair where the logarithm of the focal length has this sd."""
-        modes = tuple(replace(mode, pose=mode.pose.widened(sigma_focal)) for mode in self.modes)
-        return replace(self, pose=self.pose.widened(sigma_focal), modes=modes)
-
     def without_samples(self) -> Posterior:
         """Return the posterior without its samples, most of its memory, which are not needed after acceptance tests."""
         return replace(self, samples=_NO_POSES, weights=_NO_WEIGHTS)
