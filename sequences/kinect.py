@@ -22,7 +22,7 @@ from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
 from modeler.sequences.lens import Alignment, Lens, coefficients
 from modeler.sequences.recording import AbstractStreams, paired
 from modeler.system.processes import install_command
-from modeler.system.regular_files import check_regular
+from modeler.system.regular_files import MAX_BYTES, check_regular
 from modeler.types import Array, Camera, InputError
 
 DEPTH, COLOUR = "CALIBRATION_CameraPurposeDepth", "CALIBRATION_CameraPurposePhotoVideo"
@@ -157,16 +157,12 @@ def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
     return KinectSequence(path, lens, pairs, file, alignment, unit_mm, **about)
 
 
-_HOLE_BYTES = 1 << 30  # which the library reads in a second
-"""Largest hole of a file: zeros that were never written."""
-
-
 def _check_whole(path: Path) -> None:
     """Reject a file whose end was never written, as after a disk was full: the library would look for images in it."""
     with open(path, "rb") as file:
         size = file.seek(0, os.SEEK_END)
         hole_bytes = size - os.lseek(file.fileno(), 0, getattr(os, "SEEK_HOLE", os.SEEK_END)) if size else 0
-    if hole_bytes > _HOLE_BYTES:
+    if hole_bytes > MAX_BYTES:  # so many zeros the library reads in a second
         raise InputError(f"{path}: ends in {hole_bytes / 1e9:.0f} GB that were never written; record or copy it again.")
 
 

@@ -23,8 +23,6 @@ LEAST_DEG: Final = 0.01  # errors below this are drawn here, on the axis' lower 
 MOST_DEG: Final = 180.0
 
 _COLOURS: Final = ("#3b6fb6", "#e08e2b", "#4f9d69", "#b8474a", "#7d6bb0", "#8a6f57", "#c77fb0", "#6e6e6e")
-_BOX_IN: Final = 0.24  # width of one box with its gap
-_PANEL_IN: Final = 2.6  # height of one panel
 
 
 def rotation_errors(trials: Sequence[Trial]) -> bytes:
@@ -38,8 +36,8 @@ def rotation_errors(trials: Sequence[Trial]) -> bytes:
     objects = list(dict.fromkeys(trial.sequence for trial in trials))
     methods = list(dict.fromkeys(trial.method for trial in trials))
     offsets = sorted({trial.offset for trial in trials}) or [1]
-    width_in = max(5.0, 1.2 + _BOX_IN * (len(methods) + 1) * len(objects))
-    figure = Figure(figsize=(width_in, 1.0 + _PANEL_IN * len(offsets)), layout="constrained")
+    width_in = max(5.0, 1.2 + 0.24 * (len(methods) + 1) * len(objects))  # each box with its gap
+    figure = Figure(figsize=(width_in, 1.0 + 2.6 * len(offsets)), layout="constrained")
     panels = figure.subplots(len(offsets), 1, sharex=True, squeeze=False)[:, 0]
     for offset, panel in zip(offsets, panels, strict=True):
         _panel(panel, [trial for trial in shown if trial.offset == offset], objects, methods)
@@ -107,7 +105,6 @@ def _colour(slot: int) -> str:
 
 _NOMINAL: Final = np.linspace(0.0, 1.0, 201)  # steps of 0.5 %: a curve of 1,000 estimates has no finer ones to show
 _BAND: Final = 0.95  # of the curves of true covariances lie within
-_SQUARE_IN: Final = 4.2  # side of a panel
 _AXIS_COLOUR: Final = "#9aa3ad"
 _CONTROL_COLOUR: Final = "#b8474a"
 
@@ -143,7 +140,7 @@ def coverage_curves(panels: Sequence[Sequence[Panel]]) -> bytes:
     from matplotlib.figure import Figure  # slow to load
 
     columns = max((len(row) for row in panels), default=1)
-    size_in = (_SQUARE_IN * columns, (_SQUARE_IN + 0.2) * max(len(panels), 1) + 0.5)
+    size_in = (4.2 * columns, 4.4 * max(len(panels), 1) + 0.5)
     figure = Figure(figsize=size_in, layout="constrained")
     grid = figure.subplots(max(len(panels), 1), columns, sharex=True, sharey=True, squeeze=False)
     for axes, row in zip(grid, panels, strict=False):

@@ -103,9 +103,9 @@ def _depth_range(pixels: npt.NDArray[np.uint16], mask: BoolArray) -> tuple[float
     return float(near - margin), float(far + margin)
 
 
-MISSING, BACKGROUND, OBJECT = 0, 1, 2
+MISSING, BACKGROUND, OBJECT = range(3)
 """Areas of a picture: nothing was measured, something other than the object was, the object was."""
-AGREES, HIDDEN, VIOLATION, NO_SAY = 0, 1, 2, 3
+AGREES, HIDDEN, VIOLATION, NO_SAY = range(4)
 """Verdicts on a point: on the measured surface, behind it, in front of it, or without a measurement."""
 
 _PROJECTED_POINTS: Final = 1_200  # more would hide the picture below them

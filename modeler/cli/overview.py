@@ -61,6 +61,7 @@ SUMMARIES: Final = {
 }
 """The first sentence of each command's description, in the order in which help lists them."""
 _MODULES: Final = {
+    "register": "evaluate",
     "render": "convert",
     "calibrate-sensor": "calibrate",
     "calibrate-camera": "calibrate",

@@ -280,13 +280,17 @@ _FRAME: dict[str, Test] = {
     "cause": _null_or(_is_text),
     "mask": _null_or(_is_text),
 }
-_POSE: dict[str, Test] = {"id": _is_whole, "object_from_camera": _numbers(16), "covariance": _numbers(36)}
-_MODE: dict[str, Test] = {
-    "weight": _is_number_or_null,
+_MOTION: dict[str, Test] = {
     "target_from_source": _numbers(16),
     "covariance": _numbers(36),
     "covariance_given_camera": _null_or(_numbers(36)),
     "by_focal": _null_or(_numbers(6)),
+}
+_MODE: dict[str, Test] = {"weight": _is_number_or_null, **_MOTION}
+_POSE: dict[str, Test] = {
+    "id": _is_whole,
+    "object_from_camera": _MOTION["target_from_source"],
+    "covariance": _MOTION["covariance"],
 }
 _EDGE: dict[str, Test] = {
     "source": _is_whole,
@@ -295,10 +299,7 @@ _EDGE: dict[str, Test] = {
     "accepted": _is(bool),
     "reason": _is_text,
     "outcome": lambda value: value in [outcome.label for outcome in Outcome],
-    "target_from_source": _numbers(16),
-    "covariance": _numbers(36),
-    "covariance_given_camera": _null_or(_numbers(36)),
-    "by_focal": _null_or(_numbers(6)),
+    **_MOTION,
     "modes": _null_or(_are_modes),
     "overlap": _is_number_or_null,
     "effective_samples": _is_number_or_null,

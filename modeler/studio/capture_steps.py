@@ -44,7 +44,7 @@ _CAMERAS: Final = {
 }
 """Connected cameras, by the names under which sequences open them."""
 _BEAT_S: Final = 5.0  # of the metronome, to begin with
-_TICK_HZ, _PLACED_HZ, _LOST_HZ = 880, 660, 220  # notes that are told apart
+_NOTES_HZ: Final = {"tick": 880, "placed": 660, "lost": 220}  # which are told apart
 TONE: Final = """<script>
 window.tone = (hertz) => {
   window.sound = window.sound || new AudioContext();
@@ -150,7 +150,7 @@ class CaptureStep:
         if (report := capture.report()) is not None:
             self.ring.set_content(ring_svg(report))
         if placed is not None:
-            ui.run_javascript(f"tone({_PLACED_HZ if placed else _LOST_HZ})")
+            ui.run_javascript(f"tone({_NOTES_HZ['placed' if placed else 'lost']})")
         if self.page.viewers.live and not list(self.viewer):
             with self.viewer:
                 embedded_viewer(self.page.viewers.address(None))
@@ -158,7 +158,7 @@ class CaptureStep:
 
 def _tick(on: bool, beat_s: float) -> None:
     """Tick for each step of a turntable, or stop ticking."""
-    beat = f"window.beat = setInterval(() => tone({_TICK_HZ}), {1000.0 * max(beat_s, 0.5):.0f})" if on else ""
+    beat = f"window.beat = setInterval(() => tone({_NOTES_HZ['tick']}), {1000.0 * max(beat_s, 0.5):.0f})" if on else ""
     ui.run_javascript(f"clearInterval(window.beat); {beat}")
 
 

@@ -189,9 +189,7 @@ _MANY: Final = 100  # frames, beyond which those are large alone of which someth
 _MARKS_RGB: Final = ((31, 143, 155), (217, 115, 13), (200, 69, 63))
 """Of free space with surface of others, of surface in the free space of others, and of false surface."""
 _COVER: Final = 0.75  # of a mark over the picture
-_BACKGROUND: Final = 250  # grey level around a picture of another shape, as the page has it
 _ROOM: Final = 0.3  # around the object, as a share of its size
-_DOT: Final = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])  # pixels of a point
 
 
 @dataclass(frozen=True)
@@ -357,9 +355,10 @@ def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
     reach_m = float(np.percentile(np.abs((clouds[0][0] - centre) @ axes.T), 99.5))
     height, width = _SIZE
     places = np.rint(seen[:, :2] * (0.40 * height / max(reach_m, 1e-9)) + 0.5 * np.array([width, height]))
-    order = np.repeat(np.argsort(-seen[:, 2], kind="stable"), len(_DOT))
-    picture = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
-    dots = places[order] + np.tile(_DOT, (len(points), 1))
+    dot = np.argwhere(np.ones((2, 2)))  # its pixels
+    order = np.repeat(np.argsort(-seen[:, 2], kind="stable"), len(dot))
+    picture = np.full((height, width, 3), 250, dtype=np.uint8)  # as the page has it
+    dots = places[order] + np.tile(dot, (len(points), 1))
     inside = ((dots >= 0) & (dots < (width, height))).all(axis=1)
     columns, rows = dots[inside].astype(np.int64).T
     picture[rows, columns] = colours[order][inside]
