@@ -32,7 +32,6 @@ _EM_STEPS, _MEAN_STEPS = 4, 2  # proposals need no convergence
 _MIN_PART = 0.05  # of the weight: the few samples of a smaller part do not determine a Gaussian
 _WHITE_FLOOR = 1e-4  # of variances in whitened coordinates
 _LEAST_POWER = 0.5  # of the weights of a result: variances are at most doubled
-_TEMPERED = 1.2  # times the effective size that a usable result needs, as thinning takes a little
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +277,8 @@ class AdaptiveSampler:
             drawn = drawn.reweighted(new).plus(weighted(poses, log_density))
             log_weights = drawn.log_weights
         # A likelihood that is rough, as noise makes it, leaves few samples: they say where the mode is, not how narrow.
-        power = _power(log_weights, _TEMPERED * self.min_effective) if effective < self.min_effective else 1.0
+        least = 1.0 / (1.0 / self.min_effective - 1.0 / self.samples)  # as thinning adds up to 1 / n to the squares
+        power = _power(log_weights, least) if effective < least else 1.0
         tempered = power * log_weights if power >= _LEAST_POWER else log_weights
         chosen, weights = thinned(normalised(tempered), self.samples, rng)
         return WeightedSamples(
