@@ -133,15 +133,20 @@ class Run:
     """Reasons of status 3."""
 
 
-def run(name: str, shape: str, seed: int, frames: int, step_deg: float) -> Run:
-    """Build a sequence and evaluate the model."""
+def filmed_by(name: str, shape: str, seed: int, frames: int, step_deg: float) -> Filmed:
+    """Return a shape that is pushed about a table, as a camera observes it."""
     camera = CAMERAS[name]
     number = int(np.random.SeedSequence([seed, list(CAMERAS).index(name), *shape.encode()]).generate_state(1)[0])
     rng = np.random.default_rng(number)
     sequence = pushed(shape, seed, frames, step_deg)
     view = replace(sequence.recipe.view, distance_m=float(rng.choice(camera.distances_m)))
     rendered = RenderedSequence(replace(sequence.recipe, view=view))
-    filmed = Filmed(rendered, camera, float(np.exp(rng.normal(0.0, NOMINAL))), number)
+    return Filmed(rendered, camera, float(np.exp(rng.normal(0.0, NOMINAL))), number)
+
+
+def run(name: str, shape: str, seed: int, frames: int, step_deg: float) -> Run:
+    """Build a sequence and evaluate the model."""
+    filmed = filmed_by(name, shape, seed, frames, step_deg)
     step, report = built(filmed, PriorOptions(), seed)
     solution = step.solution
     errors = pose_errors(replace(filmed, exact=True), step)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
@@ -25,12 +25,8 @@ from modeler.composition.options import PriorOptions
 from modeler.evaluation import align_to_model
 from modeler.export import write_atomically
 from modeler.sequences.meshes import Mesh
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array
-from studies.calibration.by_camera import NOMINAL
-from studies.calibration.depth_cameras import CAMERAS
-from studies.loops.cameras import Filmed, asked
-from studies.loops.covariances import pushed
+from studies.loops.cameras import asked, filmed_by
 from studies.trust.study import built
 
 _NORMAL_MEDIAN: Final = 0.4549  # of the square of a normal variable
@@ -55,13 +51,7 @@ class Row:
 
 def row(name: str, shape: str, seed: int, frames: int, step_deg: float) -> Row:
     """Build a sequence and compare its vertices with the truth."""
-    camera = CAMERAS[name]
-    number = int(np.random.SeedSequence([seed, list(CAMERAS).index(name), *shape.encode()]).generate_state(1)[0])
-    rng = np.random.default_rng(number)
-    sequence = pushed(shape, seed, frames, step_deg)
-    view = replace(sequence.recipe.view, distance_m=float(rng.choice(camera.distances_m)))
-    rendered = RenderedSequence(replace(sequence.recipe, view=view))
-    filmed = Filmed(rendered, camera, float(np.exp(rng.normal(0.0, NOMINAL))), number)
+    filmed = filmed_by(name, shape, seed, frames, step_deg)
     step, report = built(filmed, PriorOptions(), seed)
     model = step.model
     assert model is not None
