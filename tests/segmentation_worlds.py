@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tabletop import Box
 
 from modeler.segmentation import Segmenter
 from modeler.types import Camera, Frame
@@ -24,7 +25,7 @@ class World:
     def box(self, centre_m, half_m, *, turn_deg=0.0, label=0):
         """Return the world with a box more."""
         turn = Rotation.from_rotvec([0.0, 0.0, np.radians(turn_deg)]).as_matrix()
-        self.boxes.append((np.array(centre_m), np.array(half_m), turn, label))
+        self.boxes.append((np.array(centre_m), tuple(half_m), turn, label))
         return self
 
     def table(self):
@@ -36,15 +37,12 @@ class World:
         w, h = CAMERA.rays()
         rays = np.stack([w, h, np.ones_like(w)], axis=-1).reshape(-1, 3)
         depth, labels = np.full(len(rays), np.inf), np.zeros(len(rays), dtype=int)
-        for centre, half, turn, label in self.boxes:
+        for centre, half_m, turn, label in self.boxes:
             box_from_camera = turn.T @ self.camera_from_table.T
             eye = box_from_camera @ -self.origin_m - turn.T @ centre
-            along = rays @ box_from_camera.T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                one, two = (-half - eye) / along, (half - eye) / along
-            enter, leave = np.fmin(one, two).max(axis=1), np.fmax(one, two).min(axis=1)
-            nearer = (enter <= leave) & (enter > 0.0) & (enter < depth)
-            depth[nearer], labels[nearer] = enter[nearer], label
+            found, _ = Box(half_m).cast(eye, rays @ box_from_camera.T)
+            nearer = found < depth
+            depth[nearer], labels[nearer] = found[nearer], label
         depth[np.isinf(depth)] = np.nan
         image = (depth + rng.normal(0.0, sigma_m, len(depth))).reshape(w.shape).astype(np.float32)
         return Frame(index, float(index), image, CAMERA), (labels == OBJECT).reshape(w.shape)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tabletop import Box, seen
 from test_colour_fit import printed
 from test_verdict import CAMERA, poses_of, turned
 
@@ -17,7 +18,6 @@ from modeler.verdict.likeness import flat_check, likenesses, print_check
 SIDES_DEG = (0.0, 20.0, 40.0, 60.0, 190.0, 210.0, 230.0, 250.0)
 ALIKE_DEG = [angle_deg % 180.0 for angle_deg in SIDES_DEG]
 """The same shape: an ellipsoid is the same after half a turn."""
-HALVES_M = np.array([0.1, 0.2, 0.1])
 TABLE = Plane(np.array([0.0, -1.0, 0.0]), 0.2, 0.002, 0.001)
 
 
@@ -26,18 +26,11 @@ def box(index: int, camera_from_object: Array, plane: Plane | None = None) -> Ra
     w, h = CAMERA.rays()
     rays = np.stack([w, h, np.ones_like(w)], axis=-1).reshape(-1, 3)
     turn, middle_m = camera_from_object[:3, :3], camera_from_object[:3, 3]
-    ahead, start = rays @ turn, -middle_m @ turn
-    with np.errstate(divide="ignore"):
-        enter = np.minimum((HALVES_M - start) / ahead, (-HALVES_M - start) / ahead)
-        leave = np.maximum((HALVES_M - start) / ahead, (-HALVES_M - start) / ahead).min(axis=1)
-    side, depth_m = enter.argmax(axis=1), enter.max(axis=1)
-    mask = depth_m < leave
-    points_m = rays[mask] * depth_m[mask, None]
-    normals = (-np.sign(ahead[mask, side[mask]])[:, None] * np.eye(3)[side[mask]]) @ turn.T
-    shape = (CAMERA.height, CAMERA.width)
+    depth_m, outwards = Box((0.1, 0.2, 0.1)).cast(-middle_m @ turn, rays @ turn)
+    mask, shape = np.isfinite(depth_m), (CAMERA.height, CAMERA.width)
     depth = np.where(mask, depth_m, 1.5).reshape(shape).astype(np.float32)
     frame = Frame(index, float(index), depth, CAMERA, mask.reshape(shape))
-    return RayImage(frame, plane, 0.001, 0.001, points_m, normals, np.argwhere(mask.reshape(shape)))
+    return replace(seen(frame, outwards[mask] @ turn.T, 0.001), plane=plane)
 
 
 @pytest.mark.parametrize(("found_deg", "holds"), [(SIDES_DEG, True), (ALIKE_DEG, False)])

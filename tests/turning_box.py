@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from tabletop import Box
 
 from modeler import se3
 from modeler.types import (
@@ -127,16 +128,12 @@ def _view(index: int, width: int, rng: np.random.Generator, *, colour: bool) -> 
     camera_from_box = se3.inverse(object_from_camera(index)) @ se3.translation(CENTRE_M)
     origin = se3.inverse(camera_from_box)[:3, 3]
     directions = rays @ camera_from_box[:3, :3]
+    near, outwards = Box((HALF_M[0], HALF_M[1], HALF_M[2])).cast(origin, directions)
+    hit, axis, sign = np.isfinite(near), np.abs(outwards).argmax(axis=1), outwards.sum(axis=1)
     with np.errstate(divide="ignore"):
-        first, second = (-HALF_M - origin) / directions, (HALF_M - origin) / directions
         table = (CENTRE_M[1] + HALF_M[1]) / rays[:, 1]
-    near, far = np.minimum(first, second), np.maximum(first, second)
-    hit = near.max(axis=1) < far.min(axis=1)
-    axis = near.argmax(axis=1)
-    background = np.where((table > 0) & (table < 2.0), table, 2.0)
-    depth = np.where(hit, near.max(axis=1), background)
+    depth = np.where(hit, near, np.where((table > 0) & (table < 2.0), table, 2.0))
     depth = depth + 0.001 * rng.standard_normal(len(depth))
-    sign = -np.sign(np.take_along_axis(directions, axis[:, None], axis=1)[:, 0])
     checks = 0.75 + 0.25 * (np.floor((origin + depth[:, None] * directions) / 0.025).sum(axis=1) % 2)
     rgb = np.where(hit[:, None], FACE_RGB[2 * axis + (sign > 0)] * checks[:, None], 90).astype(np.uint8)
     mask = hit.reshape(height, width)
