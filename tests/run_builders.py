@@ -9,11 +9,10 @@ import numpy as np
 import trimesh
 
 from modeler import se3
-from modeler.export import (
-    RunMeta,
-)
+from modeler.export import RunMeta
 from modeler.graph import PoseGraph, solve
 from modeler.types import (
+    Array,
     Camera,
     Edge,
     EdgeKind,
@@ -40,6 +39,20 @@ def ball(*, coloured: bool = True) -> ObjectModel:
     cloud = np.asarray(ball.vertices) + np.array([0.0, 0.0, 0.8])
     return ObjectModel(cloud[::2], normals[::2], None if colours is None else colours[::2], cloud,
                        np.asarray(ball.faces, dtype=np.int64), normals, colours)  # fmt: skip
+
+
+def block(sides_m: tuple[float, float, float], pose: Array) -> ObjectModel:
+    """A solid box about the origin of a frame, given by its pose (4, 4)."""
+    box = trimesh.creation.box(sides_m)
+    return ObjectModel(
+        points_m=np.zeros((0, 3)),
+        normals=np.zeros((0, 3)),
+        colours=None,
+        vertices_m=se3.transform(pose, np.asarray(box.vertices)),
+        triangles=np.asarray(box.faces, dtype=np.int64),
+        vertex_normals=np.asarray(box.vertex_normals) @ pose[:3, :3].T,
+        vertex_colours=None,
+    )
 
 
 def an_edge(target: int, source: int, rng: np.random.Generator, kind: EdgeKind = "odometry", **changes: Any) -> Edge:

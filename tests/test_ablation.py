@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bundled_views import views
 from slow_cases import sampled
 
-from modeler.evaluation import true_motion
 from modeler.priors import GeneralPrior
-from modeler.sequences import bundled, open_sequence
-from modeler.views import Sensor
 from studies.ablation.__main__ import registered
 from studies.ablation.pairs import Case
 from studies.ablation.tables import table
@@ -22,13 +20,8 @@ from studies.ablation.variants import VARIANTS, Variant
 @pytest.fixture(scope="module")
 def case() -> Case:
     """Return the first two frames of the bundled box."""
-    sequence = open_sequence(bundled("box"))
-    truth, noise = sequence.truth(), sequence.sensor()
-    assert truth is not None
-    assert noise is not None
-    target, source = (Sensor(noise).ray_image(sequence.frame(index)) for index in (0, 1))
-    density = GeneralPrior().between(source, target)
-    return Case("shapes", "box", "n-fold", "general", source, target, density, true_motion(truth, 0, 1), 0)
+    source, target, truth = views("box", 1, 0)
+    return Case("shapes", "box", "n-fold", "general", source, target, GeneralPrior().between(source, target), truth, 0)
 
 
 @pytest.mark.parametrize("variant", sampled(VARIANTS, every=20), ids=lambda variant: f"{variant.kind} {variant.name}")

@@ -12,7 +12,7 @@ import open3d as o3d
 import pytest
 import trimesh
 from PIL import Image
-from run_builders import an_edge, ball, made_up_steps, strict_json
+from run_builders import an_edge, ball, block, made_up_steps, strict_json
 from scipy.spatial.transform import Rotation
 from turning_box import steps
 
@@ -422,18 +422,9 @@ def _report(step: Step) -> dict:
 
 def _tower(up: Array) -> ObjectModel:
     """A long box in front of the camera, whose long side points up."""
-    box = trimesh.creation.box((0.05, 0.05, 0.3))
-    side = np.cross(up, [0.0, 0.0, 1.0])
-    turn = np.stack([side, np.cross(up, side), up], axis=1)
-    return ObjectModel(
-        points_m=np.zeros((0, 3)),
-        normals=np.zeros((0, 3)),
-        colours=None,
-        vertices_m=box.vertices @ turn.T + [0.1, 0.2, 0.8],
-        triangles=np.asarray(box.faces, dtype=np.int64),
-        vertex_normals=np.asarray(box.vertex_normals) @ turn.T,
-        vertex_colours=None,
-    )
+    side, pose = np.cross(up, [0.0, 0.0, 1.0]), se3.translation(np.array([0.1, 0.2, 0.8]))
+    pose[:3, :3] = np.stack([side, np.cross(up, side), up], axis=1)
+    return block((0.05, 0.05, 0.3), pose)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 60.0])

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from run_builders import ball
+from run_builders import ball, block
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
@@ -17,16 +17,7 @@ from modeler.types import Array, ObjectModel
 
 def brick(pose: Array) -> ObjectModel:
     """A box of 0.06 m × 0.1 m × 0.2 m; its own z is up, and it stands on z = 0."""
-    box = trimesh.creation.box((0.06, 0.1, 0.2))
-    return ObjectModel(
-        points_m=np.zeros((0, 3)),
-        normals=np.zeros((0, 3)),
-        colours=None,
-        vertices_m=se3.transform(pose @ se3.translation(np.array([0.0, 0.0, 0.1])), np.asarray(box.vertices)),
-        triangles=np.asarray(box.faces, dtype=np.int64),
-        vertex_normals=np.asarray(box.vertex_normals) @ pose[:3, :3].T,
-        vertex_colours=None,
-    )
+    return block((0.06, 0.1, 0.2), pose @ se3.translation(np.array([0.0, 0.0, 0.1])))
 
 
 def seen_from(tilt_deg: float) -> Array:

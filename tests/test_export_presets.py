@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from command_runner import Run
-from run_builders import ball
+from run_builders import ball, block
 from scipy.spatial.transform import Rotation
 from slow_cases import quick_first
 
@@ -26,17 +26,7 @@ SIDES_M = np.array([0.06, 0.1, 0.2])
 
 def brick(pose: Array | None = None) -> ObjectModel:
     """A solid box, at the origin unless a pose (4, 4) is given."""
-    box = trimesh.creation.box(SIDES_M)
-    pose = np.eye(4) if pose is None else pose
-    return ObjectModel(
-        points_m=np.zeros((0, 3)),
-        normals=np.zeros((0, 3)),
-        colours=None,
-        vertices_m=se3.transform(pose, np.asarray(box.vertices)),
-        triangles=np.asarray(box.faces, dtype=np.int64),
-        vertex_normals=np.asarray(box.vertex_normals) @ pose[:3, :3].T,
-        vertex_colours=None,
-    )
+    return block((0.06, 0.1, 0.2), np.eye(4) if pose is None else pose)
 
 
 def box_inertia(mass_kg: float) -> Array:

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bundled_views import views
 from naive_kernels import point_to_plane_equations
 from scipy import ndimage
 
 from modeler import se3
-from modeler.evaluation import rotation_error_deg, true_motion
+from modeler.evaluation import rotation_error_deg
 from modeler.kernels import point_to_plane
 from modeler.registration.posterior import weighted_gaussian
 from modeler.registration.visibility import VisibilityLikelihood
@@ -17,19 +18,13 @@ from modeler.registration.visibility.points import FixedPattern
 from modeler.registration.visibility.refinement import Refiner, shrunk, visible_share
 from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
-from modeler.sequences import bundled, open_sequence
-from modeler.views import Sensor
 
 
 def bundled_pair(name):
     """The first two frames of a bundled sequence compared, and the true motion from 1 to 0."""
-    sequence = open_sequence(bundled(name))
-    truth, noise = sequence.truth(), sequence.sensor()
-    assert truth is not None
-    assert noise is not None
-    target, source = (Sensor(noise).ray_image(sequence.frame(index)) for index in (0, 1))
+    source, target, truth = views(name, 1, 0)
     pair = VisibilityLikelihood().between(source, target, np.random.default_rng(0))
-    return pair, true_motion(truth, target=0, source=1), source.centroid_m
+    return pair, truth, source.centroid_m
 
 
 def scattered(truth, centre_m, sigmas, rng, count=400):

@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bundled_views import views
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration.visibility import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.search import Candidates, Search
-from modeler.sequences import bundled, open_sequence
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Outcome
-from modeler.views import Sensor
 from studies.calibration.by_camera import shown, viewed
 from studies.calibration.depth_cameras import CAMERAS
 from studies.calibration.specimens import load_specimen
@@ -21,17 +20,6 @@ from studies.calibration.study import Condition, rendered_views, staged
 
 MIN_OVERLAP = VisibilityRegistrar().min_overlap
 WIDE = GeneralPrior(max_rotation_deg=95.0, max_offset_m=0.08)  # the other way round a box is beyond
-
-
-def views(name, source, target):
-    """Two frames of a bundled sequence made ready, and the true motion."""
-    sequence = open_sequence(bundled(name))
-    truth, noise = sequence.truth(), sequence.sensor()
-    assert truth is not None
-    assert noise is not None
-    sensor = Sensor(noise)
-    made = [sensor.ray_image(sequence.frame(index)) for index in (source, target)]
-    return *made, true_motion(truth, target=target, source=source)
 
 
 def candidates(poses, sigmas, scores):

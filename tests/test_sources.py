@@ -6,10 +6,9 @@ import ast
 import re
 import tomllib
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from source_trees import ROOT, SOURCES, nodes, tree
+from source_trees import ROOT, SOURCES, imported, tree
 
 MAX_LINES = 500
 HOLDS_ARRAYS = re.compile(r"^(?!Callable).*(Array|ndarray)")
@@ -19,15 +18,6 @@ HOMES = {
     "rerun": "viz/",
     "tyro": ("modeler/cli/", "modeler/composition/"),
 }
-
-
-def imported(path: Path) -> Iterator[str]:
-    """Yield the top-level names that a file imports anywhere in it."""
-    for node in nodes(path):
-        if isinstance(node, ast.Import):
-            yield from (name.name.partition(".")[0] for name in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-            yield node.module.partition(".")[0]
 
 
 @pytest.mark.parametrize("library", HOMES)

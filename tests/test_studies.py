@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from source_trees import ROOT
+from source_trees import ROOT, imported
 
 from studies.__main__ import STUDIES, main
 
@@ -41,17 +39,9 @@ def test_a_study_takes_its_own_options() -> None:
 
 def test_no_study_imports_a_test_or_its_fixtures() -> None:
     fixtures = {path.stem for path in (ROOT / "tests").glob("*.py")}
-    assert {(str(path), name) for path in PROGRAMS for name in _imported(path) if name in fixtures} == set()
+    assert {(str(path), name) for path in PROGRAMS for name in imported(path) if name in fixtures} == set()
 
 
 def _module(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] in ("__main__", "__init__") else parts)
-
-
-def _imported(path: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(PROGRAMS[path])):
-        if isinstance(node, ast.Import):
-            yield from (name.name.partition(".")[0] for name in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            yield node.module.partition(".")[0]
