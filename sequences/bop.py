@@ -16,12 +16,15 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.sequences.base import AbstractSequence
-from modeler.sequences.depth_files import check_same_size, metres, no_depth, read_depth
 from modeler.sequences.image_files import (
     COLOUR_SUFFIXES,
+    check_same_size,
     check_size,
+    metres,
+    no_depth,
     object_and_occluder,
     read_colour,
+    read_depth,
     read_labels,
     read_mask,
     write_image,

@@ -17,9 +17,8 @@ from typing import BinaryIO, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from modeler.sequences.depth_files import LEAST_MM
 from modeler.sequences.file_names import frame_numbers, said_of_angles
-from modeler.sequences.image_files import MAX_PIXELS
+from modeler.sequences.image_files import LEAST_MM, MAX_PIXELS
 from modeler.sequences.input_files import input_errors, list_images
 from modeler.sequences.intrinsics import MAX_ASPECT, Intrinsics, Overrides, find_intrinsics, sane
 from modeler.sequences.recording import AbstractRecording

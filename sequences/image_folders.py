@@ -16,27 +16,25 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.sequences.depth_files import (
-    SUFFIXES,
-    check_same_size,
-    depth_size,
-    float_unit_mm,
-    is_swapped,
-    metres,
-    no_depth,
-    read_depth,
-)
 from modeler.sequences.file_names import frame_numbers, partners, role_of, said_of_angles, stamps_s
 from modeler.sequences.image_files import (
     COLOUR_SUFFIXES,
+    DEPTH_SUFFIXES,
     MASK_SUFFIXES,
     MAX_PIXELS,
+    check_same_size,
     check_size,
+    depth_size,
+    float_unit_mm,
     graded,
     image_size,
     is_finer,
+    is_swapped,
+    metres,
+    no_depth,
     object_and_occluder,
     read_colour,
+    read_depth,
     read_labels,
     read_mask,
     resize_to_depth,
@@ -234,7 +232,7 @@ def images_in_folders(path: Path) -> FoundImages:
         return {} if folder is None else list_images(folder, suffixes)
 
     folder = first_folder(path, DEPTH_FOLDERS) or path / DEPTH_FOLDERS[0]
-    depth = list_images(folder, SUFFIXES)
+    depth = list_images(folder, DEPTH_SUFFIXES)
     if not depth:
         raise no_depth(folder, "16-bit PNG or TIFF images")
     return FoundImages(
@@ -251,11 +249,11 @@ def images_in_one_folder(path: Path) -> FoundImages | None:
     by_role: dict[str, dict[str, Path]] = {}
     for image in entries(path):
         suffix = image.suffix.lower()
-        if image.name.startswith(".") or suffix not in (*SUFFIXES, *COLOUR_SUFFIXES):
+        if image.name.startswith(".") or suffix not in (*DEPTH_SUFFIXES, *COLOUR_SUFFIXES):
             continue
         role, name = role_of(image.stem)
         role = role or "colour"
-        if suffix in (SUFFIXES if role == "depth" else COLOUR_SUFFIXES):
+        if suffix in (DEPTH_SUFFIXES if role == "depth" else COLOUR_SUFFIXES):
             named = by_role.setdefault(role, {})
             if name in named:
                 raise InputError(f"{image}: there is {named[name].name} too; remove one of them.")

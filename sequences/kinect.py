@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.sequences.depth_files import metres
-from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour
+from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour
 from modeler.sequences.input_files import Node, input_errors
 from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
 from modeler.sequences.lens import Alignment, Lens, coefficients

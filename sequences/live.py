@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler.sequences.base import AbstractLive, AbstractSequence, span
-from modeler.sequences.depth_files import metres
+from modeler.sequences.image_files import metres
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.lens import Lens, coefficients
 from modeler.system.processes import install_command

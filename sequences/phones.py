@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from modeler.sequences.depth_files import metres
-from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour, resize_to_depth
+from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour, resize_to_depth
 from modeler.sequences.image_folders import FoundImages
 from modeler.sequences.input_files import MAX_BYTES, Node, input_errors, is_there, listed, read_tree
 from modeler.sequences.intrinsics import Overrides, camera_of

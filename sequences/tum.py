@@ -10,8 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.sequences.depth_files import depth_size
-from modeler.sequences.image_files import MASK_SUFFIXES
+from modeler.sequences.image_files import MASK_SUFFIXES, depth_size
 from modeler.sequences.image_folders import OCCLUDER_FOLDERS, FrameFiles, ImageFolderSequence
 from modeler.sequences.input_files import first_folder, is_there, list_images, listed, read_text
 from modeler.sequences.intrinsics import CameraFacts, Overrides, find_intrinsics

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from modeler.sequences import open_sequence, survey, write_bop
-from modeler.sequences.depth_files import read_depth
+from modeler.sequences.image_files import read_depth
 from modeler.types import Frame, InputError
 from studies.formats.clouds import WRITERS as CLOUDS
 from studies.formats.image_folders import raw_depth, save, write_bundlesdf, write_open3d, write_tum

@@ -26,10 +26,10 @@ from modeler.cli import parsed
 from modeler.sequences import GivenSequence, open_sequence, write_bop
 from modeler.studio.capture import Recorder
 from modeler.studio.jobs import Job, Queue
-from modeler.studio.pictures import outline_svg, ring_svg, thumbnail, turns_deg
 from modeler.studio.scan import Scan, drawn
 from modeler.studio.server import MOST_BYTES, Guard
 from modeler.studio.state import Studio
+from modeler.studio.widgets import outline_svg, ring_svg, thumbnail, turns_deg
 from modeler.types import BoolArray, Frame, InputError
 from studies.formats.image_folders import small_frames
 

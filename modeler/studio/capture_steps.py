@@ -14,7 +14,6 @@ from modeler.sequences.clouds import SUFFIXES
 from modeler.sequences.opening import BAGS
 from modeler.studio.capture import Capture
 from modeler.studio.jobs import Job
-from modeler.studio.pictures import ghost_svg, outline_svg, ring_svg
 from modeler.studio.scan import STATE, Choices
 from modeler.studio.widgets import (
     PRIORS,
@@ -22,10 +21,13 @@ from modeler.studio.widgets import (
     complain,
     div,
     embedded_viewer,
+    ghost_svg,
     heading,
     main_button,
+    outline_svg,
     plain_button,
     quiet,
+    ring_svg,
     sentence,
 )
 from modeler.types import InputError

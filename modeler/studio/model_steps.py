@@ -10,7 +10,6 @@ from nicegui import run, ui
 
 from modeler.export import RunFolder
 from modeler.studio.object_step import frame_address
-from modeler.studio.pictures import ring_svg
 from modeler.studio.scan import MESHES, Scan
 from modeler.studio.widgets import (
     PRIORS,
@@ -24,6 +23,7 @@ from modeler.studio.widgets import (
     mark,
     plain_button,
     quiet,
+    ring_svg,
     sentence,
 )
 from modeler.types import ACCEPTED, InputError

@@ -10,9 +10,20 @@ from urllib.parse import quote
 
 from nicegui import events, run, ui
 
-from modeler.studio.pictures import box_svg, outline_svg, stroke_svg
 from modeler.studio.scan import Scan
-from modeler.studio.widgets import command_line, complain, div, heading, main_button, mark, plain_button, quiet
+from modeler.studio.widgets import (
+    box_svg,
+    command_line,
+    complain,
+    div,
+    heading,
+    main_button,
+    mark,
+    outline_svg,
+    plain_button,
+    quiet,
+    stroke_svg,
+)
 from modeler.types import InputError
 
 if TYPE_CHECKING:

@@ -30,9 +30,9 @@ from modeler.batch.models import thumbnail_of
 from modeler.export import RunFolder
 from modeler.studio.jobs import POLL_S
 from modeler.studio.page import Page
-from modeler.studio.pictures import jpeg, thumbnail
 from modeler.studio.scan import Scan
 from modeler.studio.state import Studio
+from modeler.studio.widgets import jpeg, thumbnail
 from modeler.system.regular_files import check_regular, read_regular
 from modeler.types import InputError
 from modeler.viz.viewer import PATIENCE_S, Viewer, is_loopback, start_web

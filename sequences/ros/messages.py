@@ -12,8 +12,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.sequences.depth_files import metres, read_depth
-from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, read_colour
+from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour, read_depth
 from modeler.sequences.intrinsics import sane
 from modeler.sequences.lens import Lens, lens_of_model
 from modeler.sequences.ros.bag import Bag, from_zstd
