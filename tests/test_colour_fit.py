@@ -127,6 +127,21 @@ def test_a_plain_object_before_a_pattern_contradicts_nothing(noise: float) -> No
     assert fit.check.holds
 
 
+def test_a_pattern_that_stands_still_is_not_taken_for_print() -> None:
+    """Between views that hardly move in the image it agrees, however plain the object is."""
+    rng, angles_deg, views = np.random.default_rng(5), [6.5 * k for k in range(8)], {}
+    wall = np.full((CAMERA.height, CAMERA.width), 120.0)
+    wall[:, 91:110] += 200.0 * ndimage.gaussian_filter(rng.normal(size=(CAMERA.height, 19)), 2.0)
+    for index, angle_deg in enumerate(angles_deg):
+        view = seen(index, turned(angle_deg), axes_m=np.full(3, 0.03))
+        image = np.where(np.asarray(view.frame.mask), 120.0, wall) + 4.0 * rng.normal(size=wall.shape)
+        grey = np.clip(image, 0, 255).astype(np.uint8)
+        views[index] = replace(view, frame=replace(view.frame, colour=np.stack([grey] * 3, axis=-1)))
+    fit = colour_fit(views, poses_of(angles_deg))
+    assert fit is not None
+    assert fit.check.holds
+
+
 def test_without_colour_or_shared_surface_nothing_is_said() -> None:
     assert colour_fit(views_of(ANGLES_DEG), poses_of(ANGLES_DEG)) is None
     apart = [0.0, 90.0, 180.0]

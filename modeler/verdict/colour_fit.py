@@ -268,6 +268,12 @@ class Comparison:
         """Return the mean correlation under a displacement."""
         return float(self.correlations([displacement], width_px).mean())
 
+    def _still(self, displacement: Displacement) -> float:
+        """Return the mean correlation under a displacement of what pairs show in the same pixels."""
+        there = np.tile(self.places(displacement.frames)[:, :2], 2)
+        features, row = self.features(self.width_px), displacement.row()[None]
+        return float(displaced_correlations(features, self._indices, self._starts, there, row).mean())
+
     def edges(self, displacement: Displacement) -> float:
         """Return how steep (0..1) colours are along the outline of surface under a displacement, on average."""
         order, found = list(self.views), []
@@ -301,9 +307,10 @@ class Comparison:
         tried += [(each, self.correlation(each, fine_px)) for each in times]
         best, found = max(tried, key=lambda each: each[1])
         clear = found >= max(AT_LEAST, correlation + _CHANCE_SDS * chance)
-        # A plain object on a printed table that turns with it agrees where colour is that of the table.
+        # A plain object on a printed table that turns with it agrees where colour is that of the table, and before
+        # scenery that stands still, under some poses, where it is that of the scenery.
         outlined = self.edges(best) > _OUTLINED * self.edges(here)
-        return (best, found) if clear and outlined else (here, correlation)
+        return (best, found) if clear and outlined and found > self._still(best) else (here, correlation)
 
     def _grid(self, step_px: float) -> Iterator[Displacement]:
         """Yield displacements as far apart as the coarse band is wide."""
