@@ -438,6 +438,11 @@ def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
         read_table(tmp_path / TABLE)
 
 
+def test_a_row_of_a_manifest_may_say_what_its_input_does_not(tmp_path: Path) -> None:
+    (row,) = read_manifest(manifest(tmp_path, "sequence,depth-scale-mm,along-ray\na,0.5,yes\n"))
+    assert row.arguments == ("--depth-scale-mm", "0.5", "--along-ray")
+
+
 def test_a_manifest_may_come_from_a_spreadsheet(tmp_path: Path) -> None:
     path = tmp_path / "list.csv"
     path.write_bytes('\ufeffsequence,prior\r\n"a, b",table\r\n'.encode())

@@ -131,7 +131,7 @@ def _jobs(options: Batch) -> list[Job]:
     from modeler.types import InputError
 
     groups = (options.model, options.prior, options.method, options.selection, options.where, options.given)
-    common = tuple(word for group in groups for word in as_arguments(group))
+    common = as_arguments(*groups)
     rows = [Row(path, f"{path}") for path in options.sequences]
     if options.manifest is not None:
         rows += read_manifest(options.manifest, common)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from modeler.cli.console import Console, Interrupt, as_options, say
-from modeler.cli.options import MIN_VOXEL_M, FrameOptions, InputOptions, ModelOptions
+from modeler.cli.options import MIN_VOXEL_M, FrameOptions, InputOptions, ModelOptions, given_options
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
 
@@ -148,22 +148,18 @@ class Build:
 
     def command(self, changes: Mapping[str, str]) -> str:
         """Return the command line that replaces the run by one with other parameters."""
-        changes = {name.replace("_", "-"): value for name, value in changes.items()}
-        given = {"prior": self.prior.prior, **self.settings(), "seed": self.method.seed}
-        given |= {name: getattr(self.model, name) for name in ("sensor", "camera")}  # paths as given
-        usual = {"every": 1, "frames": ":", "method": "visibility", "colour": True, "seed": 0}
-        words = {
-            name.replace("_", "-"): shlex.join(map(str, value if isinstance(value, tuple) else (value,)))
-            for name, value in given.items()
-            if value not in (None, ()) and usual.get(name) != value
-        }
-        if changes.get("prior", words.get("prior")) != words.get("prior"):  # parameters of another prior
-            words = {name: value for name, value in words.items() if name.replace("-", "_") not in vars(self.prior)}
-        if words.pop("colour", None) is not None:
-            words["no-colour"] = ""  # a flag
-        if "along-ray" in words:
-            words["along-ray"] = ""
-        options = " ".join(f"--{name} {value}".rstrip() for name, value in {**words, **changes}.items())
+        same = changes.get("prior", self.prior.prior) == self.prior.prior  # else its parameters are of another prior
+        groups = (
+            self.prior if same else PriorOptions(),
+            self.selection,
+            self.where,
+            self.model,
+            self.given,
+            self.method,
+        )
+        words = {name: shlex.join(map(str, values)) for name, values in given_options(*groups).items()}
+        words |= {f"--{name.replace('_', '-')}": value for name, value in changes.items()}
+        options = " ".join(f"{name} {value}".rstrip() for name, value in words.items())
         return (
             f"modeler build {shlex.quote(str(self.sequence))} --out {shlex.quote(str(self.out))} --overwrite {options}"
         )

@@ -109,8 +109,7 @@ def _checked(words: tuple[str, ...], common: tuple[str, ...]) -> tuple[str, ...]
     if alone is None:
         return ()
     assert isinstance(alone, Build)
-    groups = (alone.model, alone.prior, alone.method, alone.selection, alone.where)
-    return tuple(word for group in groups for word in as_arguments(group))
+    return as_arguments(alone.model, alone.prior, alone.method, alone.selection, alone.where, alone.given)
 
 
 def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:

@@ -63,20 +63,23 @@ class FrameOptions:
     """Use frame numbers from A up to, but not including, B; either may be left out."""
 
 
-def as_arguments(options: object) -> tuple[str, ...]:
-    """Return the command line that gives a group of options the values it has; nothing for those that are the default.
+def given_options(*groups: object) -> dict[str, tuple[object, ...]]:
+    """Return the options of groups that have other values than their defaults, each with its values."""
+    found: dict[str, tuple[object, ...]] = {}
+    for group in groups:
+        for one in fields(group):  # pyright: ignore[reportArgumentType]
+            value = getattr(group, one.name)
+            if value != one.default:
+                name = f"--{'no-' if value is False else ''}{one.name.replace('_', '-')}"
+                found[name] = () if isinstance(value, bool) else value if isinstance(value, tuple) else (value,)
+    return found
 
-    Files are named by their absolute paths.
-    """
+
+def as_arguments(*groups: object) -> tuple[str, ...]:
+    """Return the command line that gives groups of options the values they have; files are named by absolute paths."""
     words: list[str] = []
-    for one in fields(options):  # pyright: ignore[reportArgumentType]
-        value = getattr(options, one.name)
-        if value == one.default:
-            continue
-        words.append(f"--{'no-' if value is False else ''}{one.name.replace('_', '-')}")
-        if not isinstance(value, bool):
-            parts = value if isinstance(value, tuple) else (value,)
-            words += [str(part.absolute() if isinstance(part, Path) else part) for part in parts]
+    for name, values in given_options(*groups).items():
+        words += [name, *(str(value.absolute() if isinstance(value, Path) else value) for value in values)]
     return tuple(words)
 
 

@@ -136,7 +136,7 @@ class Preset:
             raise InputError(f"{self.out}: is not a folder; choose another `out`")
         if self.purpose == "isaac":
             check_installed("pxr", "usd-core", "usd")
-        check_files(self._outs(textured=True), inputs, overwrite=self.overwrite)
+        check_files(self._outs(), inputs, overwrite=self.overwrite)
         scenes = self.out / "onboarding_static"
         if self.purpose == "bop" and scenes.exists() and (not scenes.is_dir() or any(scenes.iterdir())):
             raise InputError(f"{scenes}: exists already; remove it or give another `out`")
@@ -156,23 +156,23 @@ class Preset:
         }
         return written[self.purpose]()
 
-    def _outs(self, *, textured: bool) -> tuple[Path, ...]:
+    def _outs(self) -> tuple[Path, ...]:
         """Return the files to write, except convex parts and scenes, whose number is unknown before."""
         if self.purpose == "bop":
             return (self._bop_model, self._bop_model.with_name(bop.MODELS_INFO))
         if self.purpose in _MESHES:
-            meshes = files.files_of(self._mesh, textured=textured and self.purpose == "foundationpose")
+            meshes = files.files_of(self._mesh, textured=self.purpose == "foundationpose")
             return (*meshes, files.pose_file(self._mesh))
         if self.purpose == "nerfstudio":
             return (self.out / "transforms.json", self._points, files.pose_file(self._points))
         if self.purpose == "colmap":
             return (*(self.out / "sparse" / "0" / f"{name}.bin" for name in ("cameras", "images", "points3D")),)
-        of = solids.PhysicsFiles(self.out, textured)
+        of = solids.PhysicsFiles(self.out, coloured=True)
         if self.purpose == "isaac":
             return (of.usd, of.texture, files.pose_file(of.usd))
         of_programs = {"mujoco": (of.mjcf, of.scene), "urdf": (of.urdf,), "gazebo": (of.sdf, of.config)}
         model = of_programs[self.purpose]
-        return (*model, *files.files_of(of.visual, textured=textured), files.pose_file(of.visual), of.part(0))
+        return (*model, *files.files_of(of.visual, textured=True), files.pose_file(of.visual), of.part(0))
 
     @property
     def _mesh(self) -> Path:
