@@ -122,7 +122,7 @@ class Spherical:
 
 _RIGHT = np.array([[0, 1, 0], [1, 0, 0], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [1, 0, 0]], np.float64)
 _DOWN = np.array([[0, 0, -1]] * 4 + [[0, -1, 0], [0, 1, 0]], np.float64)
-_OUT = np.array([[1, 0, 0], [0, -1, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
+_OUT = np.cross(_DOWN, _RIGHT)
 
 
 @dataclass(frozen=True)

@@ -209,9 +209,6 @@ def _svg(figure: Figure) -> bytes:
 
 _SLICE: Final = 0.03  # of all points, those that lie nearest to the level
 _MARGIN: Final = 0.04  # room around the points, as a share of their extent
-_SIDE: Final = np.array([0, 1])  # across and up: the plane of a picture from the side
-_ABOVE: Final = np.array([0, 2])  # across and away: the plane of one from above
-_NEARNESS: Final = np.array([0.0, 1.0, -1.0])  # viewing direction of both pictures, normal to their planes
 _STRAY: Final = 0.002  # the share of points at either end that may lie outside the picture
 _TALLEST_IN: Final = 7.0  # the picture, so that a page shows it whole
 _LEVEL_COLOUR: Final = "#c8453f"
@@ -222,15 +219,16 @@ class _Cloud:
     """Points of several frames."""
 
     points_m: Array
-    """(n, 3) across, up, and away from who looks from the side."""
+    """(n, 3) across and up in a picture, and away from who looks at it."""
     order: npt.NDArray[np.int64]
     """(n,) which frame each is from, counted from 0."""
 
-    def near(self, level_m: float) -> _Cloud:
-        """Return the points that lie nearest to a level."""
-        away_m = np.abs(self.points_m[:, 1] - level_m)
-        kept = away_m <= np.quantile(away_m, _SLICE)
-        return _Cloud(self.points_m[kept], self.order[kept])
+    def slice_at(self, level_m: float) -> _Cloud:
+        """Return the points that lie nearest to a level, as seen from above."""
+        off_m = np.abs(self.points_m[:, 1] - level_m)
+        kept = off_m <= np.quantile(off_m, _SLICE)
+        across, up, away = self.points_m[kept].T
+        return _Cloud(np.stack([across, away, -up], axis=1), self.order[kept])
 
 
 def merged_clouds(result: Result, surfaces_m: Mapping[int, Array]) -> bytes:
@@ -242,19 +240,19 @@ def merged_clouds(result: Result, surfaces_m: Mapping[int, Array]) -> bytes:
     """
     axes = _broadside(result, surfaces_m)
     before, after = (_merged(poses, surfaces_m, axes) for poses in (result.chain, result.poses))
-    box_m = _box_m((before, after), _SIDE)
+    box_m = _box_m((before, after))
     level_m = float(box_m[:, 1].mean())
-    slices = [cloud.near(level_m) for cloud in (before, after)]
-    slice_box_m = _box_m(slices, _ABOVE)
+    slices = [cloud.slice_at(level_m) for cloud in (before, after)]
+    slice_box_m = _box_m(slices)
     shares = [float(np.ptp(box[:, 1]) / np.ptp(box[:, 0])) for box in (box_m, slice_box_m)]
     figure = new_figure(9.0, min(4.4 * sum(shares) + 0.6, _TALLEST_IN))
     (top, bottom) = figure.subplots(2, 2, height_ratios=shares)
     for axis, cloud, title in zip(top, (before, after), ("before closure", "after closure"), strict=True):
-        _draw_cloud(axis, cloud, _SIDE, box_m, size=0.5)
+        _draw_cloud(axis, cloud, box_m, size=0.5)
         axis.axhline(level_m, color=_LEVEL_COLOUR, linewidth=0.6)
         axis.set_title(title, fontsize=10, loc="left")
     for axis, cloud in zip(bottom, slices, strict=True):
-        _draw_cloud(axis, cloud, _ABOVE, slice_box_m, size=3.0)
+        _draw_cloud(axis, cloud, slice_box_m, size=3.0)
         axis.set_title("slice at the red line, from above", fontsize=10, loc="left")
     return png(figure, dpi=120)
 
@@ -277,19 +275,18 @@ def _merged(poses: Mapping[int, PoseGaussian], surfaces_m: Mapping[int, Array], 
     return _Cloud(np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts]))
 
 
-def _box_m(clouds: Sequence[_Cloud], plane: npt.NDArray[np.int64]) -> Array:
-    """Return the lowest and the highest coordinates (2, 2) in a plane, with a margin, without a few strays."""
-    places_m = np.concatenate([cloud.points_m[:, plane] for cloud in clouds])
+def _box_m(clouds: Sequence[_Cloud]) -> Array:
+    """Return the lowest and the highest coordinates (2, 2) in a picture, with a margin, without a few strays."""
+    places_m = np.concatenate([cloud.points_m[:, :2] for cloud in clouds])
     low, high = np.quantile(places_m, (_STRAY, 1.0 - _STRAY), axis=0)
     margin_m = _MARGIN * float((high - low).max()) + 1e-6
     return np.array([low - margin_m, high + margin_m])
 
 
-def _draw_cloud(axis: Axes, cloud: _Cloud, plane: npt.NDArray[np.int64], box_m: Array, *, size: float) -> None:
-    """Draw points in a plane of their axes, nearer ones over farther ones."""
-    (depth,) = np.setdiff1d(np.arange(3), plane)
-    order = np.argsort(_NEARNESS[depth] * cloud.points_m[:, depth], kind="stable")
-    axis.scatter(*cloud.points_m[order][:, plane].T, c=cloud.order[order], cmap="viridis", s=size, linewidths=0)
+def _draw_cloud(axis: Axes, cloud: _Cloud, box_m: Array, *, size: float) -> None:
+    """Draw points, nearer ones over farther ones."""
+    order = np.argsort(-cloud.points_m[:, 2], kind="stable")
+    axis.scatter(*cloud.points_m[order, :2].T, c=cloud.order[order], cmap="viridis", s=size, linewidths=0)
     axis.set_xlim(*box_m[:, 0])
     axis.set_ylim(*box_m[:, 1])
     axis.set_aspect("equal")
