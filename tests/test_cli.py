@@ -95,6 +95,7 @@ def report(folder: Path) -> dict:
         (("build", "SCENE", "--out", "OUT", "--max-rotation-deg", "nan"), "--max-rotation-deg nan"),
         (("build", "SCENE", "--out", "OUT", "--max-rotation-deg", "181"), "--max-rotation-deg 181"),
         (("build", "SCENE", "--out", "OUT", "--resume", "--overwrite"), "--resume"),
+        (("build", "SCENE", "--model", "NOWHERE", "--out", "OUT", "--voxel-m", "0.002"), "leave out --voxel-m\n"),
         (("build", "NOWHERE", "--out", "OUT"), "NOWHERE"),
         (("register", "SCENE", "0", "99"), "no frame 99"),
         (("register", "SCENE", "2", "2"), "both frame 2"),

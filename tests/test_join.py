@@ -330,5 +330,5 @@ def test_options_of_a_build_from_nothing_are_refused(
     folder = grown[0].parent
     words = ["build", str(folder / "second"), "--model", str(folder / "upright_run"), "--out", str(folder / "other")]
     assert main([*words, "--prior", "table"]) == 2
-    assert "leave out --resume, --watch and --prior" in capsys.readouterr().err
+    assert capsys.readouterr().err.endswith("leave out --prior\n")
     assert not (folder / "other").exists()

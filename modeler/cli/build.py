@@ -185,8 +185,15 @@ def _check(options: Build) -> None:
 
     if options.resume and options.overwrite:
         raise InputError("--resume keeps what --overwrite deletes; give one of them")
-    if options.known is not None and (options.resume or options.watch or options.prior.prior):
-        raise InputError("--model places frames on a finished model; leave out --resume, --watch and --prior")
+    if options.known is not None:
+        method, model = (
+            replace(options.method, seed=MethodOptions.seed),
+            replace(options.model, sensor=None, camera=None),
+        )
+        unused = [f"--{name}" for name in ("resume", "watch", "view", "web", "connect") if getattr(options, name)]
+        unused += given_options(options.prior, method, model)
+        if unused:
+            raise InputError(f"--model places frames on a finished model; leave out {', '.join(unused)}")
     voxel_m = options.model.voxel_m
     if voxel_m is not None and not MIN_VOXEL_M <= voxel_m < 1.0:
         raise InputError(f"--voxel-m {voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
