@@ -277,7 +277,8 @@ class AdaptiveSampler:
             drawn = drawn.reweighted(new).plus(weighted(poses, log_density))
             log_weights = drawn.log_weights
         # A likelihood that is rough, as noise makes it, leaves few samples: they say where the mode is, not how narrow.
-        least = 1.0 / (1.0 / self.min_effective - 1.0 / self.samples)  # as thinning adds up to 1 / n to the squares
+        room = 1.0 / self.min_effective - 1.0 / self.samples  # thinning adds up to 1 / n to the squares of the weights
+        least = 1.0 / room if room > 0.0 else self.min_effective  # fewer samples than are needed may be asked for
         power = _power(log_weights, least) if effective < least else 1.0
         tempered = power * log_weights if power >= _LEAST_POWER else log_weights
         chosen, weights = thinned(normalised(tempered), self.samples, rng)
