@@ -25,8 +25,15 @@ def text(outcomes: Sequence[Outcome]) -> str:
             (one["part"], one["texture"] if one["part"] == "aligned" else one["way"]) for one in built
         )
         rows = [(f"{part}, {kind}", *counts(_of(built, part, kind))) for part, kind in names]
-        rows += [(f"{part}, all", *counts([one for one in built if one["part"] == part])) for part in dict(names)]
+        rows += [
+            (f"{part}, all", *counts([one for one in built if one["part"] == part]))
+            for part in dict.fromkeys(part for part, _ in names)
+        ]
         parts.append(markdown(columns, rows))
+        aligned = [one for one in built if one["part"] == "aligned"]
+        textures = tuple(dict.fromkeys(one["texture"] for one in aligned))
+        if aligned:
+            parts.append(markdown(("body", *textures), models(aligned, textures)))
     captures = [one for one in outcomes if one["part"] == "captures" and "codes" in one]
     if captures:
         columns = ("capture, colour", "placed", "status", "reasons", "loop", "error, median / largest", "built in")
@@ -48,16 +55,34 @@ def counts(outcomes: Sequence[Outcome]) -> tuple[int, ...]:
     return len(outcomes), sum(before), sum(run), either, sum(one["status"] == 0 for one in outcomes)
 
 
+def models(outcomes: Sequence[Outcome], textures: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the errors and exit statuses of models, a row a body with a cell a texture."""
+    rows = []
+    for body in dict.fromkeys(one["body"] for one in outcomes):
+        cells = []
+        for texture in textures:
+            some = [one for one in outcomes if (one["body"], one["texture"]) == (body, texture)]
+            cells.append("; ".join(f"{_pose_errors(one)}, {one['status']}" for one in some))
+        rows.append((body, *cells))
+    return rows
+
+
+def _pose_errors(one: Outcome) -> str:
+    """Return the median and the largest rotation error of a build."""
+    errors = one["errors_deg"]
+    return "-" if errors is None else f"{errors[0]:.2f}° / {errors[1]:.2f}°"
+
+
 def capture(one: Outcome) -> tuple[str, ...]:
     """Return the row of a build of a capture."""
-    loop, errors = one["loop_sd"], one["errors_deg"]
+    loop = one["loop_sd"]
     return (
         f"`{one['body']}`" if one["way"] == ALIGNED else f"`{one['body']}`, {one['way']}",
         one["placed"],
         str(one["status"]),
         ", ".join(one["codes"]) + (" (edges)" if one["before"] else ""),
         "-" if loop is None else f"{loop:.1f} sd",
-        "-" if errors is None else f"{errors[0]:.2f}° / {errors[1]:.2f}°",
+        _pose_errors(one),
         f"{one['built_s']:.0f} s",
     )
 
