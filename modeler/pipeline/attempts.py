@@ -19,7 +19,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure import Closer
 from modeler.graph.focal import LIMIT_STEPS
-from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, SEPARATE_RAD, converged_or
+from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, are_apart, converged_or
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
 from modeler.types import (
@@ -306,12 +306,11 @@ def unless_alike(within: Posterior, wider: Posterior, density: AbstractPoseDensi
         density: the prior density, with the limits.
     """
     if within.outcome is Outcome.AT_LIMIT and within.matches and wider.usable:
-        separate = se3.rotation_angle(se3.inverse(within.pose.mean) @ wider.pose.mean) > SEPARATE_RAD
         # Only for one mode: the mean of several may lie inside without being near any of them.
         inside = wider.outcome is Outcome.CONVERGED and _inside(density, wider.pose.mean[None])[0]
         better_nats = wider.log_marginal_likelihood - within.log_marginal_likelihood
         similar_overlap = wider.overlap < within.overlap + _MIN_OVERLAP_GAIN
-        if separate and not inside and similar_overlap and better_nats < BEYOND_LIMITS_NATS:
+        if are_apart(within, wider) and not inside and similar_overlap and better_nats < BEYOND_LIMITS_NATS:
             return replace(within, outcome=Outcome.AMBIGUOUS)
     return _discounted(wider, density)
 

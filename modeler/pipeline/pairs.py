@@ -32,8 +32,8 @@ BEYOND_LIMITS_NATS: Final = 7.0
 """Prior log odds of a motion within the prior's limits: one in a thousand exceeds them."""
 SEGMENTED: Final = (Outcome.CONVERGED, Outcome.UNSURE_MASK, Outcome.CUT_OFF)
 """Outcomes of a segmentation that has found an object."""
-SEPARATE_RAD: Final = 0.26
-"""Registrations that differ by a larger rotation are two modes."""
+_SEPARATE_RAD: Final = 0.26
+"""Rotation between two modes: wider than a basin of attraction (`Search.basin`), in which descents end at one mode."""
 _CONTRADICTED_NATS: Final = 4.6
 """Log odds against a match that the images contradict: they contradict one of 100 right ones (`Posterior`)."""
 
@@ -155,6 +155,11 @@ def converged_or(within: Posterior, unlimited: Posterior) -> Posterior:
 
 def _beaten(within: Posterior, unlimited: Posterior) -> Posterior:
     """Return a registration as one at the limits, if surface matches elsewhere without them."""
-    elsewhere = se3.rotation_angle(se3.inverse(within.pose.mean) @ unlimited.pose.mean) > SEPARATE_RAD
     matches = unlimited.overlap >= unlimited.least_overlap
-    return replace(within, outcome=Outcome.AT_LIMIT) if within.usable and elsewhere and matches else within
+    beaten = within.usable and matches and are_apart(within, unlimited)
+    return replace(within, outcome=Outcome.AT_LIMIT) if beaten else within
+
+
+def are_apart(one: Posterior, other: Posterior) -> bool:
+    """Return whether two registrations of a pair are at different modes."""
+    return bool(se3.rotation_angle(se3.inverse(one.pose.mean) @ other.pose.mean) > _SEPARATE_RAD)
