@@ -144,7 +144,7 @@ def test_ghosts_stay_with_their_mode_and_spread_about_it(run: list[Step]) -> Non
             for pose in shown.poses[shown.mode_of == number]
         ]
         assert 0.0 < max(apart_m) < 0.3 * HALF_M.max()
-    recording_of = dict(pair_view.draw_magnified_posterior(replace(step, posteriors=(modal,))))
+    recording_of = dict(pair_view.draw_posterior(replace(step, posteriors=(modal,))))
     labels = recording_of[entities.GHOST_LABELS]
     assert isinstance(labels, rr.Points3D)
     assert labels.labels is not None

@@ -104,9 +104,6 @@ def _colour(slot: int) -> str:
 
 
 _NOMINAL: Final = np.linspace(0.0, 1.0, 201)  # steps of 0.5 %: a curve of 1,000 estimates has no finer ones to show
-_BAND: Final = 0.95  # of the curves of true covariances lie within
-_AXIS_COLOUR: Final = "#9aa3ad"
-_CONTROL_COLOUR: Final = "#b8474a"
 
 
 @dataclass(frozen=True)
@@ -167,11 +164,11 @@ def _draw_curves(axis: Axes, panel: Panel) -> None:
     axis.plot([0.0, 1.0], [0.0, 1.0], color="#444444", linewidth=0.8)
     count = len(panel.curves[0].nees) if panel.curves else 0
     if count:
-        low, high = stats.binom(count, _NOMINAL).interval(_BAND)
+        low, high = stats.binom(count, _NOMINAL).interval(0.95)
         axis.fill_between(_NOMINAL, np.maximum(low, 0.0) / count, high / count, color="#dddddd", linewidth=0.0)
     colours = iter(_COLOURS[:3] * len(panel.curves))
     for curve in panel.curves:
-        style = {"axis": (_AXIS_COLOUR, 0.8, "-", 2), "control": (_CONTROL_COLOUR, 1.6, "--", 4)}.get(curve.role)
+        style = {"axis": ("#9aa3ad", 0.8, "-", 2), "control": ("#b8474a", 1.6, "--", 4)}.get(curve.role)
         colour, width, dashes, order = style if style is not None else (next(colours), 2.0, "-", 3)
         axis.plot(
             _NOMINAL,

@@ -19,9 +19,6 @@ from modeler.viz.readings import pose_table
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])  # from the object towards the eye that looks at the whole graph
 
-_POSES: Final = 150  # largest number of poses that are all drawn; of more, every n-th
-_CAMERA_SIZE: Final = 0.1  # as a share of the distance to the object
-
 
 def draw_graph(step: Step) -> Drawing:
     """Yield all cameras and the edges between them, in the object frame."""
@@ -41,19 +38,19 @@ def draw_newest_camera(step: Step) -> Drawing:
     if current is None:
         yield entities.CURRENT, CLEAR
     else:
-        style = (entities.CURRENT_RGB, 3.0)
+        style = (entities.SOURCE_RGB, 3.0)
         yield entities.CURRENT, _frusta(current[None], step.frame.camera, 1.3 * camera_size_m(step), style)
 
 
 def shown(step: Step) -> list[int]:
-    """Return the frames whose poses are drawn: all, or every n-th of many."""
+    """Return the frames whose poses are drawn: all of up to 150, or every n-th of more."""
     numbers = sorted(step.solution.trajectory)
-    return numbers[:: math.ceil(max(len(numbers), 1) / _POSES)]
+    return numbers[:: math.ceil(max(len(numbers), 1) / 150)]
 
 
 def camera_size_m(step: Step) -> float:
     """Return the length of a drawn camera and of its axes."""
-    return _CAMERA_SIZE * distance_m(step)
+    return 0.1 * distance_m(step)
 
 
 def distance_m(step: Step) -> float:
@@ -113,7 +110,6 @@ def _axes(poses: Array, size_m: float) -> rr.AsComponents:
     )
 
 
-_LARGEST_3_SIGMA: Final = 0.3  # half axis of the largest ellipsoid of a chain, as a share of the object's distance
 _SOLID: Final = rr.components.FillMode.Solid
 _WIRE: Final = rr.components.FillMode.MajorWireframe
 
@@ -188,4 +184,5 @@ def magnification(edges: Sequence[Edge], distance_m: float) -> float:
     if not variances:
         return 1.0
     sigma_m = math.sqrt(max(9.0 * variances[0], sum(variances)))  # room for nine edges from the start
-    return min(max(rounded_down(_LARGEST_3_SIGMA * distance_m / (3.0 * sigma_m)), 0.1), 1000.0)
+    largest_m = 0.3 * distance_m  # half axis of the largest ellipsoid of a chain
+    return min(max(rounded_down(largest_m / (3.0 * sigma_m)), 0.1), 1000.0)

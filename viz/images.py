@@ -19,10 +19,7 @@ from modeler.views import Sensor
 from modeler.viz import entities
 from modeler.viz.drawings import CLEAR, Drawing, shown_posterior
 
-_PIXELS: Final = 500_000  # larger images are shown at a whole fraction of their size
-_DEPTH_PIXELS: Final = 100_000  # the same of depth, which is drawn as points
 _DEPTH_UNITS_PER_M: Final = 1000.0  # finer units make the picture no better and the file several times larger
-_RUN_LENGTHS: Final = 3  # zlib's strategy; for filtered depth the quickest, and small
 
 
 def draw_frame(step: Step) -> Drawing:
@@ -69,13 +66,13 @@ def _runs(change: npt.NDArray[np.int8]) -> Array:
 
 
 def stride_px(frame: Frame) -> int:
-    """Return the stride at which images of the frame are drawn."""
-    return math.ceil(math.sqrt(frame.depth_m.size / _PIXELS))
+    """Return the stride at which images of the frame are drawn: half a million pixels at most."""
+    return math.ceil(math.sqrt(frame.depth_m.size / 500_000))
 
 
 def depth_stride_px(frame: Frame) -> int:
     """Return the stride of depth images: larger, as they compress slowly and finer ones show no more."""
-    return math.ceil(math.sqrt(frame.depth_m.size / _DEPTH_PIXELS))
+    return math.ceil(math.sqrt(frame.depth_m.size / 100_000))
 
 
 def _depth_png(depth_m: npt.NDArray[np.float32], mask: BoolArray) -> rr.EncodedDepthImage:
@@ -83,7 +80,7 @@ def _depth_png(depth_m: npt.NDArray[np.float32], mask: BoolArray) -> rr.EncodedD
     units = np.nan_to_num(depth_m * _DEPTH_UNITS_PER_M, nan=0.0, posinf=0.0, neginf=0.0)
     pixels = np.clip(np.rint(units), 0, np.iinfo(np.uint16).max).astype(np.uint16)
     return rr.EncodedDepthImage(
-        blob=encoded(pixels, "PNG", compress_level=1, compress_type=_RUN_LENGTHS),
+        blob=encoded(pixels, "PNG", compress_level=1, compress_type=3),  # by run lengths: the quickest, and small
         media_type="image/png",
         meter=_DEPTH_UNITS_PER_M,
         depth_range=_depth_range(pixels, mask),
@@ -108,13 +105,12 @@ MISSING, BACKGROUND, OBJECT = range(3)
 AGREES, HIDDEN, VIOLATION, NO_SAY = range(4)
 """Verdicts on a point: on the measured surface, behind it, in front of it, or without a measurement."""
 
-_PROJECTED_POINTS: Final = 1_200  # more would hide the picture below them
 _VERDICT: Final = np.zeros(len(kernel.CLASSES), dtype=np.int8)  # by that of the likelihood
 _VERDICT[[kernel.MATCHED, kernel.UNKNOWN]] = AGREES, NO_SAY
 _VERDICT[[kernel.HIDDEN, kernel.BEHIND]] = HIDDEN
 _VERDICT[[kernel.IN_FRONT, kernel.IN_EMPTY_SPACE, kernel.IN_SUPPORT]] = VIOLATION
 _PATHS: Final = {
-    AGREES: (entities.VISIBILITY_AGREES, entities.AGREES_RGB, 1.25),
+    AGREES: (entities.VISIBILITY_AGREES, entities.SOURCE_RGB, 1.25),
     HIDDEN: (entities.VISIBILITY_HIDDEN, entities.HIDDEN_RGB, 1.0),
     NO_SAY: (entities.VISIBILITY_NO_SAY, entities.NO_SAY_RGB, 1.0),
     VIOLATION: (entities.VISIBILITY_VIOLATIONS, entities.VIOLATION_RGB, 3.0),
@@ -187,7 +183,7 @@ def projection(source: RayImage, target: RayImage, target_from_source: Array) ->
     """
     if min(len(source.points_m), len(target.points_m)) == 0:
         return ProjectedPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.int8))
-    likelihood, rng = VisibilityLikelihood(points=_PROJECTED_POINTS), np.random.default_rng(0)
+    likelihood, rng = VisibilityLikelihood(points=1_200), np.random.default_rng(0)  # more would hide what is below
     projected = likelihood.between(_ready(source), _ready(target), rng).forward
     points_m = se3.transform(target_from_source, projected.points[:, :3])
     verdicts = _VERDICT[projected.classify(se3.rows(target_from_source))]

@@ -23,7 +23,6 @@ from modeler.viz.images import draw_outlined, stride_px
 if TYPE_CHECKING:
     from modeler.suggestion import Belief, Suggestions
 
-_MODEL_POINTS: Final = 15_000  # of the cloud, which is recorded again at each step
 TRIANGLES: Final = 60_000  # of a mesh as drawn, in a recording or on a page, and points of all views, recorded once
 _PLAIN: Final = (215, 215, 215)  # surface without colour
 
@@ -35,7 +34,7 @@ def draw_model(step: Step) -> Drawing:
     if model is None or meshed:
         yield entities.CLOUD, CLEAR
     else:
-        stride = math.ceil(max(len(model.points_m), 1) / _MODEL_POINTS)
+        stride = math.ceil(max(len(model.points_m), 1) / 15_000)  # recorded again at each step
         normals = model.normals[::stride]
         colours = shaded(_PLAIN, normals) if model.colours is None else model.colours[::stride]
         yield entities.CLOUD, rr.Points3D(model.points_m[::stride], colors=colours, radii=POINT_SIZE)
@@ -82,9 +81,6 @@ def coarsened(vertices: Array, triangles: npt.NDArray[np.int64], limit: int) -> 
     return merged, kept
 
 
-_RAMP_RGB: Final = ((70, 100, 255), (40, 190, 190), (255, 225, 60))  # from the first view to the last
-
-
 def draw_merged_clouds(step: Step) -> Drawing:
     """Yield the merged points along the chain of edges and after optimisation, on the last step alone."""
     if step.last and len(step.solution.trajectory) > 1:
@@ -98,7 +94,8 @@ def _merged_points(step: Step, poses: Mapping[int, Array]) -> rr.Points3D:
     stride = math.ceil(max(sum(len(step.views[frame].points_m) for frame in frames), 1) / TRIANGLES)
     parts = [se3.transform(poses[frame], step.views[frame].points_m[::stride]) for frame in frames]
     along = np.linspace(0.0, 2.0, max(len(frames), 2))[: len(frames)]
-    shades = np.stack([np.interp(along, [0.0, 1.0, 2.0], channel) for channel in zip(*_RAMP_RGB, strict=True)], axis=1)
+    ramps = (70, 40, 255), (100, 190, 225), (255, 190, 60)  # red, green and blue at the first, middle and last view
+    shades = np.stack([np.interp(along, [0.0, 1.0, 2.0], ramp) for ramp in ramps], axis=1)
     colours = np.repeat(np.rint(shades), [len(part) for part in parts], axis=0)
     return rr.Points3D(
         np.concatenate([np.zeros((0, 3)), *parts]), colors=colours.astype(np.uint8), radii=rr.Radius.ui_points(1.25)

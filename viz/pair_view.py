@@ -31,69 +31,9 @@ from modeler.viz.drawings import (
 from modeler.viz.readings import worst_axis_sd
 
 _DRAWS: Final = 80  # samples, of which each is still seen by itself
-_LENGTH: Final = 1.1  # of the axes, in distances of the farthest point from the centroid: they stick out of the object
-
-
-def draw_posterior(step: Step) -> Drawing:
-    """Yield the axes of the source at the mean of the pair's posterior, and their ends under draws from it."""
-    posterior = shown_posterior(step)
-    if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
-        yield entities.PAIR_AXES, CLEAR
-        yield entities.PAIR_DRAWS, CLEAR
-        return
-    mean = posterior.pose.mean
-    yield (
-        entities.PAIR_AXES,
-        rr.Arrows3D(
-            origins=np.tile(se3.transform(mean, step.view.centroid_m), (3, 1)),
-            vectors=axes_length_m(step.view) * mean[:3, :3].T,
-            colors=np.array(entities.AXIS_RGB, dtype=np.uint8),
-            radii=rr.Radius.ui_points(0.75),
-        ),
-    )
-    yield entities.PAIR_DRAWS, _tips(step.view, draws(posterior), 2.0)
-
-
-def _tips(view: RayImage, poses: Array, points: float) -> rr.Points3D:
-    """Return the ends of the object's axes at poses (n, 4, 4), as dots of a size on the screen."""
-    ends = view.centroid_m + axes_length_m(view) * np.eye(3)
-    places = np.einsum("nij,kj->nki", poses[:, :3, :3], ends) + poses[:, None, :3, 3]
-    colours = np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(poses), 1))
-    return rr.Points3D(places.reshape(-1, 3), colors=colours, radii=rr.Radius.ui_points(points))
-
-
-def _radius_m(view: RayImage) -> float:
-    """Return the distance of the farthest point from the centroid."""
-    return float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
-
-
-def axes_length_m(view: RayImage) -> float:
-    """Return the length of the object's axes as drawn."""
-    return _LENGTH * _radius_m(view)
-
-
-def draws(posterior: Posterior) -> Array:
-    """Return samples (n, 4, 4) of a posterior, the same at every call.
-
-    They are taken at even steps of the cumulative weight; without samples, they are the sigma points of the
-    covariance.
-    """
-    if len(posterior.samples) > 0:
-        cumulative = np.cumsum(posterior.weights)
-        steps = (np.arange(_DRAWS) + 0.5) / _DRAWS * cumulative[-1]
-        return posterior.samples[np.minimum(np.searchsorted(cumulative, steps), len(cumulative) - 1)]
-    variances, axes = np.linalg.eigh(posterior.pose.covariance)
-    sds = (np.sqrt(np.maximum(variances, 0.0)) * axes).T
-    return posterior.pose.mean @ se3.exp(np.concatenate([sds, -sds]))
-
-
-_GHOSTS: Final = 20  # samples that are drawn as a whole object
-_GHOST_POINTS: Final = 200  # of each of these
-_MEAN_POINTS: Final = 1_500  # of all modes together, which stand out against them
-_SHOWN_SD: Final = 0.12  # of the farthest point under the widest mode, as a share of its distance from the centre
-_MOST_RAD: Final = 0.25  # sd of the rotation as drawn: beyond it a magnified spread no longer looks like one
-_GHOST_LIGHT: Final = 0.55  # of the colour of their mode
 _PATHS: Final = (
+    entities.PAIR_AXES,
+    entities.PAIR_DRAWS,
     entities.GHOSTS,
     entities.GHOST_MEANS,
     entities.GHOST_TIPS,
@@ -117,22 +57,69 @@ class Ghosts:
     """(n,) the mode of each sample."""
 
 
-def draw_magnified_posterior(step: Step) -> Drawing:
-    """Yield the source at every mode and at samples, the ends of its axes, and the ellipsoid of its centre."""
+def draw_posterior(step: Step) -> Drawing:
+    """Yield the posterior of the step's pair: to scale the source's axes, magnified the source and its centre.
+
+    To scale, the axes at the mean and their ends under samples. Magnified, the source at every mode and at samples, the
+    ends of its axes, and the ellipsoids of its centre.
+    """
     posterior = shown_posterior(step)
     if posterior is None or step.view is None or not np.isfinite(posterior.pose.covariance).all():
         for path in _PATHS:
             yield path, CLEAR
         return
-    view, ghosts = step.view, magnified(posterior, step.view)
+    view, mean, ghosts = step.view, posterior.pose.mean, magnified(posterior, step.view)
+    yield (
+        entities.PAIR_AXES,
+        rr.Arrows3D(
+            origins=np.tile(se3.transform(mean, view.centroid_m), (3, 1)),
+            vectors=axes_length_m(view) * mean[:3, :3].T,
+            colors=np.array(entities.AXIS_RGB, dtype=np.uint8),
+            radii=rr.Radius.ui_points(0.75),
+        ),
+    )
+    yield entities.PAIR_DRAWS, _tips(view, draws(posterior), 2.0)
     colours = np.array([entities.MODE_RGB[k % len(entities.MODE_RGB)] for k in range(len(ghosts.modes))])
-    few = view.points_m[:: math.ceil(len(view.points_m) / _GHOST_POINTS)]
+    few = view.points_m[:: math.ceil(len(view.points_m) / 200)]
     points = np.concatenate([se3.transform(pose, few) for pose in ghosts.poses])
-    dim = np.repeat((_GHOST_LIGHT * colours[ghosts.mode_of]).astype(np.uint8), len(few), axis=0)
+    dim = np.repeat((0.55 * colours[ghosts.mode_of]).astype(np.uint8), len(few), axis=0)
     yield entities.GHOSTS, rr.Points3D(points, colors=dim, radii=rr.Radius.ui_points(0.6))
     yield entities.GHOST_MEANS, _means(view, ghosts.modes, colours)
     yield entities.GHOST_TIPS, _tips(view, ghosts.poses, 2.5)
     yield from _centres(view, ghosts, colours)
+
+
+def _tips(view: RayImage, poses: Array, points: float) -> rr.Points3D:
+    """Return the ends of the object's axes at poses (n, 4, 4), as dots of a size on the screen."""
+    ends = view.centroid_m + axes_length_m(view) * np.eye(3)
+    places = np.einsum("nij,kj->nki", poses[:, :3, :3], ends) + poses[:, None, :3, 3]
+    colours = np.tile(np.array(entities.AXIS_RGB, dtype=np.uint8), (len(poses), 1))
+    return rr.Points3D(places.reshape(-1, 3), colors=colours, radii=rr.Radius.ui_points(points))
+
+
+def _radius_m(view: RayImage) -> float:
+    """Return the distance of the farthest point from the centroid."""
+    return float(np.linalg.norm(view.points_m - view.centroid_m, axis=1).max())
+
+
+def axes_length_m(view: RayImage) -> float:
+    """Return the length of the object's axes as drawn: they stick out of it."""
+    return 1.1 * _radius_m(view)
+
+
+def draws(posterior: Posterior) -> Array:
+    """Return samples (n, 4, 4) of a posterior, the same at every call.
+
+    They are taken at even steps of the cumulative weight; without samples, they are the sigma points of the
+    covariance.
+    """
+    if len(posterior.samples) > 0:
+        cumulative = np.cumsum(posterior.weights)
+        steps = (np.arange(_DRAWS) + 0.5) / _DRAWS * cumulative[-1]
+        return posterior.samples[np.minimum(np.searchsorted(cumulative, steps), len(cumulative) - 1)]
+    variances, axes = np.linalg.eigh(posterior.pose.covariance)
+    sds = (np.sqrt(np.maximum(variances, 0.0)) * axes).T
+    return posterior.pose.mean @ se3.exp(np.concatenate([sds, -sds]))
 
 
 def magnified(posterior: Posterior, view: RayImage) -> Ghosts:
@@ -143,7 +130,7 @@ def magnified(posterior: Posterior, view: RayImage) -> Ghosts:
     modes = posterior.modes or (Mode(1.0, posterior.pose),)
     centre = se3.translation(view.centroid_m)
     drawn = draws(posterior)
-    drawn = drawn[np.linspace(0, len(drawn) - 1, min(_GHOSTS, len(drawn))).astype(np.int64)]
+    drawn = drawn[np.linspace(0, len(drawn) - 1, min(20, len(drawn))).astype(np.int64)]  # as whole objects
     mode_of = np.array([_nearest(modes, pose) for pose in drawn])
     means = np.array([mode.pose.mean for mode in modes])[mode_of] @ centre
     factor = _factor(modes, view)
@@ -164,7 +151,11 @@ def _nearest(modes: Sequence[Mode], pose: Array) -> int:
 
 
 def _factor(modes: Sequence[Mode], view: RayImage) -> float:
-    """Return the magnification of the samples."""
+    """Return the magnification of the samples.
+
+    The farthest point under the widest mode has an sd of 12 % of its distance from the centre as drawn, and the
+    rotation one of 0.25 rad at most: beyond it a magnified spread no longer looks like one.
+    """
     radius_m = _radius_m(view)
     widest_rad, widest_m = 0.0, 0.0
     for mode in modes:
@@ -173,13 +164,13 @@ def _factor(modes: Sequence[Mode], view: RayImage) -> float:
         widest_rad, widest_m = max(widest_rad, turn_rad), max(widest_m, math.hypot(radius_m * turn_rad, shift_m))
     if not widest_m > 0.0:
         return 1.0
-    wanted = min(_SHOWN_SD * radius_m / widest_m, _MOST_RAD / max(widest_rad, 1e-9))
+    wanted = min(0.12 * radius_m / widest_m, 0.25 / max(widest_rad, 1e-9))
     return min(rounded_down(wanted), 1000.0) if wanted >= 1.0 else 1.0
 
 
 def _means(view: RayImage, modes: Sequence[Mode], colours: npt.NDArray[np.int64]) -> rr.Points3D:
-    """Return the source's cloud at the mean of every mode."""
-    stride = math.ceil(len(view.points_m) * len(modes) / _MEAN_POINTS)
+    """Return the source's cloud at the mean of every mode, of so many points that they stand out against samples."""
+    stride = math.ceil(len(view.points_m) * len(modes) / 1_500)
     points, normals = view.points_m[::stride], view.normals[::stride]
     return rr.Points3D(
         np.concatenate([se3.transform(mode.pose.mean, points) for mode in modes]),

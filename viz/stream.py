@@ -217,7 +217,6 @@ class RerunStream:
             images.draw_frame,
             pair_view.draw_pair,
             pair_view.draw_posterior,
-            pair_view.draw_magnified_posterior,
             images.draw_projected_points,
         )
         of_model = (model_view.draw_model, model_view.draw_merged_clouds, graph_view.draw_newest_camera)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,9 @@ _STEP = 1e-6  # rad and m: a smaller step ends a level
 FINE = (1 / 32, 1 / 64)  # voxels that start from a global registration, in sizes of the object
 DAMPING = 1e-9  # relative to the mean curvature; only fixes unobservable directions
 
+Level = Callable[[Cloud, Cloud, Array, float], Fit]
+"""Fits downsampled clouds, source and target, from a pose (4, 4), given the voxel edge in m."""
+
 
 @dataclass(frozen=True)
 class AbstractMultiscaleRegistrar(AbstractCloudRegistrar):
@@ -38,6 +41,17 @@ class AbstractMultiscaleRegistrar(AbstractCloudRegistrar):
     """Largest distance of correspondences, in voxels."""
     iterations: int = 60
     """Largest number of steps per level."""
+
+    def by_levels(self, source: Cloud, target: Cloud, target_from_source: Array, level: Level) -> Fit | None:
+        """Return the fit of the finest level, each starting from the result of the coarser; None without any level."""
+        fit = None
+        if min(len(source.points_m), len(target.points_m)) < self.min_points:
+            return None
+        for voxel_m in cube_edges_m(source, target, self.voxels):
+            thin = source.thinned(voxel_m), target.thinned(voxel_m)
+            if min(len(cloud.points_m) for cloud in thin) >= self.min_points:
+                fit = level(*thin, target_from_source if fit is None else fit.target_from_source, voxel_m)
+        return fit
 
 
 @dataclass(frozen=True)
@@ -53,9 +67,7 @@ class IcpRegistrar(AbstractMultiscaleRegistrar):
 
     def refine(self, source: Cloud, target: Cloud, target_from_source: Array) -> Fit | None:
         """Return the local optimum from a pose (4, 4); None if there are too few points."""
-        return by_levels(
-            (source, target), target_from_source, voxels=self.voxels, min_points=self.min_points, level=self._level
-        )
+        return self.by_levels(source, target, target_from_source, self._level)
 
     def _level(self, source: Cloud, target: Cloud, pose: Array, voxel_m: float) -> Fit:
         tree, reach_m = KDTree(target.points_m), self.reach * voxel_m
@@ -80,33 +92,6 @@ class Linearised:
     """(n, 6) by the ξ of `pose @ exp(ξ)`."""
     fitness: float
     """Fraction of the source's points that have a correspondence."""
-
-
-def by_levels(
-    clouds: tuple[Cloud, Cloud],
-    target_from_source: Array,
-    *,
-    voxels: Sequence[float],
-    min_points: int,
-    level: Callable[[Cloud, Cloud, Array, float], Fit],
-) -> Fit | None:
-    """Return the fit of the finest level, each starting from the result of the coarser one; None without any level.
-
-    Args:
-        clouds: of source and target.
-        target_from_source: (4, 4) initial pose.
-        voxels: voxel edge at each level, coarse to fine, as a fraction of the object's size.
-        min_points: least number of points of each cloud; levels with fewer are skipped.
-        level: fits downsampled clouds from a pose (4, 4), given the voxel edge in m.
-    """
-    fit = None
-    if min(len(cloud.points_m) for cloud in clouds) < min_points:
-        return None
-    for voxel_m in cube_edges_m(*clouds, voxels):
-        thin = clouds[0].thinned(voxel_m), clouds[1].thinned(voxel_m)
-        if min(len(cloud.points_m) for cloud in thin) >= min_points:
-            fit = level(*thin, target_from_source if fit is None else fit.target_from_source, voxel_m)
-    return fit
 
 
 def descended(source: Cloud, pose: Array, iterations: int, linearised: Callable[[Array, Array], Linearised]) -> Fit:
@@ -195,8 +180,7 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
     """
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
-        clouds = Cloud.coloured(source), Cloud.coloured(target)
-        return by_levels(clouds, initial, voxels=self.voxels, min_points=self.min_points, level=self.level)
+        return self.by_levels(Cloud.coloured(source), Cloud.coloured(target), initial, self.level)
 
     def level(self, source: Cloud, target: Cloud, pose: Array, voxel_m: float) -> Fit:
         """Return the local optimum from a pose (4, 4), for downsampled clouds with intensity."""
@@ -208,18 +192,16 @@ class ColouredIcpRegistrar(AbstractMultiscaleRegistrar):
 
         def linearised(points_m: Array, pose: Array) -> Linearised:
             near, partner = nearest(points_m, tree, pose, reach_m)
-            partners = Cloud(target.points_m[partner], target.normals[partner])
-            matches = Matches(points_m[near], partners, float(np.mean(near)))
-            gaps_m, by_gap = plane_residuals(matches, pose)
+            seen_m, there_m, fitness = points_m[near], target.points_m[partner], float(np.mean(near))
+            gaps_m, by_gap = plane_residuals(Matches(seen_m, Cloud(there_m, target.normals[partner]), fitness), pose)
             # Gradients lie in the tangent plane: offsets along the normal do not change the predicted intensity.
-            predicted, by_intensity = plane_residuals(
-                Matches(matches.points_m, Cloud(partners.points_m, gradients[partner]), matches.fitness), pose
-            )
+            slopes = Matches(seen_m, Cloud(there_m, gradients[partner]), fitness)
+            predicted, by_intensity = plane_residuals(slopes, pose)
             differences = source_intensity[near] - target_intensity[partner] - predicted
             shares = np.sqrt([0.968, 1.0 - 0.968])  # of squared distances in m and squared differences of intensity
             residuals = np.concatenate([shares[0] * gaps_m, shares[1] * differences])
             jacobian = np.concatenate([shares[0] * by_gap, -shares[1] * by_intensity])
-            return Linearised(residuals, np.ones(len(residuals)), jacobian, matches.fitness)
+            return Linearised(residuals, np.ones(len(residuals)), jacobian, fitness)
 
         return descended(source, pose, self.iterations, linearised)
 

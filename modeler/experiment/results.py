@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -85,7 +85,7 @@ class _Candidate:
     model_from_object: Array
     """(4, 4) aligns it with the true model."""
     model_from_camera: Mapping[int, Array]
-    """Its poses (4, 4), so align_to_model, by frame number."""
+    """Its poses (4, 4), aligned so, by frame number."""
 
 
 def model_scores(modelled: Modelled, fuser: Fuser, seed: int) -> list[ModelScore]:
@@ -158,11 +158,7 @@ def models_json(scores: Sequence[ModelScore], seed: int) -> str:
 
 def models_csv(scores: Sequence[ModelScore]) -> str:
     """Return scores as CSV, a field a column."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [f.name for f in fields(ModelScore)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(score) for score in scores)
-    return text.getvalue()
+    return _csv([f.name for f in fields(ModelScore)], map(asdict, scores))
 
 
 def evaluate(
@@ -225,11 +221,16 @@ def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence
 
 def results_csv(trials: Sequence[Trial]) -> str:
     """Return the trials as CSV, a field a column but for the estimate; numbers that are not finite are empty."""
-    text = io.StringIO()
     names = [f.name for f in fields(Trial) if f.name != "target_from_source"]
+    return _csv(names, (_finite(asdict(trial)) for trial in trials))
+
+
+def _csv(names: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
+    """Return some values of rows as a table."""
+    text = io.StringIO()
     writer = csv.DictWriter(text, names, lineterminator="\n", extrasaction="ignore")
     writer.writeheader()
-    writer.writerows(_finite(asdict(trial)) for trial in trials)
+    writer.writerows(rows)
     return text.getvalue()
 
 

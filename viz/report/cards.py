@@ -185,11 +185,8 @@ large.onclick = () => large.close();
 """
 _SIZE: Final = (150, 200)  # height and width in px
 _MASK_SIZE: Final = (360, 480)  # as large as it has room beside its words
-_MANY: Final = 100  # frames, beyond which those are large alone of which something is doubtful
 _MARKS_RGB: Final = ((31, 143, 155), (217, 115, 13), (200, 69, 63))
 """Of free space with surface of others, of surface in the free space of others, and of false surface."""
-_COVER: Final = 0.75  # of a mark over the picture
-_ROOM: Final = 0.3  # around the object, as a share of its size
 
 
 @dataclass(frozen=True)
@@ -240,8 +237,8 @@ def thumbnails(rows: Mapping[str, Mapping[int, Row]], report: Mapping[str, Any])
 
 
 def size_px(frames: int, *, doubtful: bool) -> tuple[int, int]:
-    """Return height and width of a frame's picture, of so many: of many, only doubtful ones are large."""
-    return _MASK_SIZE if doubtful or frames <= _MANY else _SIZE
+    """Return height and width of a frame's picture, of so many: of more than 100, only doubtful ones are large."""
+    return _MASK_SIZE if doubtful or frames <= 100 else _SIZE
 
 
 def with_outline(rows: Mapping[str, Mapping[int, Row]], frame: int, size: tuple[int, int]) -> bytes | None:
@@ -315,17 +312,17 @@ def _mark(pixels: Array, marks: Marks, box: Array, area: int) -> None:
         if len(centres):
             near_px = KDTree(centres).query(np.column_stack([columns.ravel(), rows.ravel()]))[0]
             covered = near_px.reshape(height, width) <= reach
-            pixels[covered] = (1.0 - _COVER) * pixels[covered] + _COVER * np.array(rgb)
+            pixels[covered] = 0.25 * pixels[covered] + 0.75 * np.array(rgb)
 
 
 def _around(on: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    """Return the box (left, top, right, bottom) around the set pixels of a mask (h, w), with a margin."""
+    """Return the box (left, top, right, bottom) around the set pixels of a mask (h, w), with room of 0.3 its size."""
     height, width = on.shape
     if not on.any():
         return 0, 0, width, height
     rows, columns = np.flatnonzero(on.any(axis=1)), np.flatnonzero(on.any(axis=0))
     shape = np.array([width / height, 1.0])  # that of the whole picture, so that it has room for the box
-    extent = np.array([np.ptp(columns) + 1, np.ptp(rows) + 1]) * (1.0 + 2.0 * _ROOM)
+    extent = np.array([np.ptp(columns) + 1, np.ptp(rows) + 1]) * 1.6
     size = np.minimum(float((extent / shape).max()) * shape, [width, height])
     middle = 0.5 * np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1])
     start = np.clip(middle - 0.5 * size, 0.0, np.array([width, height]) - size)

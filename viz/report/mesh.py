@@ -102,7 +102,6 @@ def _packed(array: npt.NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-_FIELD_OF_VIEW_DEG: Final = 30.0  # vertical
 _SAMPLES: Final = 2  # rays along each side of a pixel, without which edges are jagged
 
 
@@ -123,7 +122,7 @@ def shade(
         size: height and width in px.
     """
     height, width = size[0] * _SAMPLES, size[1] * _SAMPLES
-    focal = 0.5 * height / np.tan(np.radians(0.5 * _FIELD_OF_VIEW_DEG))
+    focal = 0.5 * height / np.tan(np.radians(15.0))  # half of the vertical field of view
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
     along = np.stack(
         [(columns - 0.5 * (width - 1)) / focal, (rows - 0.5 * (height - 1)) / focal, np.ones((height, width))], axis=-1

@@ -27,7 +27,6 @@ from modeler.viz.report.cards import data_address, mask_cards, pair_cards, thumb
 from modeler.viz.report.mesh import Mesh, portrait, read_mesh, scene
 from modeler.viz.report.run_data import Result, Row, recorded, surfaces
 
-_CAMERA_SHARE: Final = 0.12  # length of a drawn camera, as a share of its distance
 _SYMMETRIES: Final = (
     "Rotations that map the model onto itself: in any two of these poses it looks the same, so that a pose estimator "
     "cannot tell one from the other. Unobserved surface is not compared."
@@ -276,8 +275,8 @@ def _name(result: Result) -> str:
 
 
 def _pyramid(object_from_camera: Array) -> Array:
-    """Return a camera (n, 3) as one line in the object frame."""
-    size_m = _CAMERA_SHARE * max(float(np.linalg.norm(object_from_camera[:3, 3])), 0.3)
+    """Return a camera (n, 3) as one line in the object frame, as long as 12 % of its distance."""
+    size_m = 0.12 * max(float(np.linalg.norm(object_from_camera[:3, 3])), 0.3)
     corners = size_m * np.array([[-0.55, -0.4, 1.0], [0.55, -0.4, 1.0], [0.55, 0.4, 1.0], [-0.55, 0.4, 1.0]])
     tip = np.zeros(3)
     outline = [tip, *corners, corners[0], tip, corners[1], corners[2], tip, corners[3]]

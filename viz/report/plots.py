@@ -23,12 +23,9 @@ if TYPE_CHECKING:
 
 AFTER: Final = "#3b6fb6"
 BEFORE: Final = "#8a6bb8"
-TRUE: Final = "#4f9d69"
 ODOMETRY: Final = "#7a828c"
 CLOSURE: Final = "#2f9e58"
-REJECTED: Final = "#c8453f"
 _DRAWS: Final = 4000  # of a norm: its 95 % quantile is then known to 1 %
-_SHAPE: Final = "#c9ced4"
 _CIRCLE: Final = np.stack([np.cos(np.linspace(0, 2 * np.pi, 49)), np.sin(np.linspace(0, 2 * np.pi, 49))])
 
 
@@ -41,7 +38,7 @@ def trajectory(result: Result, shape_m: Array) -> bytes:
     plans = (("from above", np.stack([across, np.cross(up, across)])), ("from the side", np.stack([across, up])))
     for axis, (title, axes) in zip(figure.subplots(1, 2), plans, strict=True):
         flat = (shape_m - middle) @ axes.T
-        axis.scatter(flat[:, 0], flat[:, 1], s=0.4, color=_SHAPE, linewidths=0, rasterized=True)
+        axis.scatter(flat[:, 0], flat[:, 1], s=0.4, color="#c9ced4", linewidths=0, rasterized=True)
         _cameras(axis, result, axes, middle)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_title(title, fontsize=10, loc="left")
@@ -68,7 +65,7 @@ def _cameras(axis: Axes, result: Result, axes: Array, middle: Array) -> None:
     true = {frame: pose for frame in result.poses if (pose := result.true_pose(frame)) is not None}
     if true:
         places = (np.array([pose[:3, 3] for pose in true.values()]) - middle) @ axes.T
-        axis.plot(*places.T, "x", color=TRUE, markersize=5, label="truth")
+        axis.plot(*places.T, "x", color="#4f9d69", markersize=5, label="truth")
     axis.plot(*((result.poses[result.first].mean[:3, 3] - middle) @ axes.T), "o", color="#222222", markersize=4)
 
 
@@ -207,13 +204,6 @@ def _svg(figure: Figure) -> bytes:
     return picture.getvalue()
 
 
-_SLICE: Final = 0.03  # of all points, those that lie nearest to the level
-_MARGIN: Final = 0.04  # room around the points, as a share of their extent
-_STRAY: Final = 0.002  # the share of points at either end that may lie outside the picture
-_TALLEST_IN: Final = 7.0  # the picture, so that a page shows it whole
-_LEVEL_COLOUR: Final = "#c8453f"
-
-
 @dataclass(frozen=True, eq=False)
 class _Cloud:
     """Points of several frames."""
@@ -224,9 +214,9 @@ class _Cloud:
     """(n,) which frame each is from, counted from 0."""
 
     def slice_at(self, level_m: float) -> _Cloud:
-        """Return the points that lie nearest to a level, as seen from above."""
+        """Return the 3 % of the points that lie nearest to a level, as seen from above."""
         off_m = np.abs(self.points_m[:, 1] - level_m)
-        kept = off_m <= np.quantile(off_m, _SLICE)
+        kept = off_m <= np.quantile(off_m, 0.03)
         across, up, away = self.points_m[kept].T
         return _Cloud(np.stack([across, away, -up], axis=1), self.order[kept])
 
@@ -245,11 +235,11 @@ def merged_clouds(result: Result, surfaces_m: Mapping[int, Array]) -> bytes:
     slices = [cloud.slice_at(level_m) for cloud in (before, after)]
     slice_box_m = _box_m(slices)
     shares = [float(np.ptp(box[:, 1]) / np.ptp(box[:, 0])) for box in (box_m, slice_box_m)]
-    figure = new_figure(9.0, min(4.4 * sum(shares) + 0.6, _TALLEST_IN))
+    figure = new_figure(9.0, min(4.4 * sum(shares) + 0.6, 7.0))  # so that a page shows it whole
     (top, bottom) = figure.subplots(2, 2, height_ratios=shares)
     for axis, cloud, title in zip(top, (before, after), ("before closure", "after closure"), strict=True):
         _draw_cloud(axis, cloud, box_m, size=0.5)
-        axis.axhline(level_m, color=_LEVEL_COLOUR, linewidth=0.6)
+        axis.axhline(level_m, color="#c8453f", linewidth=0.6)
         axis.set_title(title, fontsize=10, loc="left")
     for axis, cloud in zip(bottom, slices, strict=True):
         _draw_cloud(axis, cloud, slice_box_m, size=3.0)
@@ -276,10 +266,10 @@ def _merged(poses: Mapping[int, PoseGaussian], surfaces_m: Mapping[int, Array], 
 
 
 def _box_m(clouds: Sequence[_Cloud]) -> Array:
-    """Return the lowest and the highest coordinates (2, 2) in a picture, with a margin, without a few strays."""
+    """Return the lowest and the highest coordinates (2, 2) in a picture, with a margin, without 0.2 % of strays."""
     places_m = np.concatenate([cloud.points_m[:, :2] for cloud in clouds])
-    low, high = np.quantile(places_m, (_STRAY, 1.0 - _STRAY), axis=0)
-    margin_m = _MARGIN * float((high - low).max()) + 1e-6
+    low, high = np.quantile(places_m, (0.002, 0.998), axis=0)
+    margin_m = 0.04 * float((high - low).max()) + 1e-6
     return np.array([low - margin_m, high + margin_m])
 
 
