@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
-from scipy.fft import next_fast_len
 
 from modeler.types import FLIPS, Array, Flip, Frame
 
@@ -160,6 +159,8 @@ class _Search:
     """Correlation of edges of depth and colour over shifts, summed over frames."""
 
     def __init__(self, pairs: Sequence[tuple[Array, Array]]) -> None:
+        from scipy.fft import next_fast_len  # many import this module who align no colour
+
         height, width = pairs[0][0].shape
         self._reach = round(_REACH * width)
         self._size = tuple(next_fast_len(size + self._reach, real=True) for size in (height, width))

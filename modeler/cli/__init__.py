@@ -17,12 +17,13 @@ import resource
 import shlex
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from modeler.cli import messages
@@ -126,8 +127,10 @@ def parsed(arguments: Sequence[str]) -> Command:
 
     command, conf, box = command_class(name), tyro.conf, io.StringIO()
     style = conf.OmitSubcommandPrefixes, conf.OmitArgPrefixes, conf.FlagCreatePairsOff, conf.DisallowNone
+    # It asks typeguard, which takes 0.05 s to import, whether defaults are of the declared types, as is checked before.
+    unasked = SimpleNamespace(check_type=lambda value, _: value, TypeCheckError=TypeError)
     try:
-        with contextlib.redirect_stderr(box):
+        with contextlib.redirect_stderr(box), _instead_of("typeguard", unasked):
             told = f"{inspect.cleandoc(command.__doc__ or '')}\n\n{messages.HELP}"
             return tyro.cli(command, prog=f"modeler {name}", description=told, args=others, config=style)
     except SystemExit as ending:
@@ -182,18 +185,22 @@ def _run(command: Command) -> int:
 
 def _import_numba() -> None:
     """Import Numba without the settings that it looks for in the current folder, in a file of YAML."""
+    with _instead_of("yaml", None), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        importlib.import_module("numba")
+
+
+@contextlib.contextmanager
+def _instead_of(name: str, module: Any) -> Iterator[None]:
+    """Meanwhile, import another module under a name; None: no module has it."""
     modules: dict[str, Any] = sys.modules
-    if "numba" in modules or not os.path.lexists(".numba_config.yaml"):
-        return
-    yaml, modules["yaml"] = modules.get("yaml"), None
+    before, modules[name] = modules.get(name), module
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            importlib.import_module("numba")
+        yield
     finally:
-        del modules["yaml"]
-        if yaml is not None:
-            modules["yaml"] = yaml
+        del modules[name]
+        if before is not None:
+            modules[name] = before
 
 
 def _check_environment() -> None:

@@ -14,11 +14,11 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
+from modeler.graph import lazy_gtsam as gtsam
 from modeler.graph.covariance import chi_square_quantile
 from modeler.graph.pose_graph import Factor, inverse_right_jacobian
 from modeler.priors.common_axis import MIN_TURN_RAD
@@ -26,7 +26,7 @@ from modeler.types import Array, segments
 
 Rows = Mapping[int, Array]  # by variable, blocks (m, 6) of whitened rows
 _SLIP = [0, 1, 3, 4, 5]  # components of ξ other than the rotation about the axis
-_AXIS = gtsam.symbol("a", 0)  # beyond all frame numbers
+_AXIS = ord("a") << 56  # as GTSAM numbers the symbol a0: beyond all frame numbers
 # Standard deviations of A about its initial estimate, rad and m. The rotation about the axis is not observable and is
 # fixed; the origin's position along the axis is loosely so; the rest is practically free.
 _AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])

@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 from scipy.linalg import get_blas_funcs
 from scipy.special import gammaincinv
 
 from modeler import se3
+from modeler.graph import lazy_gtsam as gtsam
 from modeler.graph.optimise import gtsam_graph_of, values_of
 from modeler.graph.pose_graph import ROOT_SIGMA, Factor, PoseGraph
 from modeler.types import Array, FocalLength, Solution

@@ -13,9 +13,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import gtsam
 import numpy as np
 
+from modeler.graph import lazy_gtsam as gtsam
 from modeler.graph.pose_graph import Factor, chain
 from modeler.types import Array
 

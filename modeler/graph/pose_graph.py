@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import gtsam
 import numpy as np
 
 from modeler import se3
+from modeler.graph import lazy_gtsam as gtsam
 from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, Posterior, are_separate, pooled
 
 ROOT_SIGMA = 1e-9  # standard deviation of the root's pose in rad and m: practically zero, but positive definite

@@ -29,6 +29,7 @@ import numba
 import numpy as np
 from numba.core.caching import _Cache  # pyright: ignore[reportPrivateUsage]
 from numba.core.compiler import CompileResult
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
 _HERE: Final = Path(__file__).parent
@@ -86,7 +87,7 @@ class KernelCache(_Cache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled code for a signature; None if there is none that can be relied on."""
-        target_context.refresh()
+        rtsys.initialize(target_context)  # all that code needs; what a compilation looks up takes 0.2 s to import
         name = self._file_name(sig, target_context.codegen())
         for folder in _folders():
             content = _content(folder / name)
@@ -99,7 +100,10 @@ class KernelCache(_Cache):
         """Keep compiled code, in the first folder that takes it."""
         if data.library.has_dynamic_globals or any(not lifted.can_cache for lifted in data.lifted):
             return
-        name, content = self._file_name(sig, data.codegen), dumps(data._reduce())
+        *parts, environments = data._reduce()
+        # Empty ones are of Numba's own functions, of which loading would import the modules.
+        content = dumps((*parts, [environment for environment in environments if environment.consts]))
+        name = self._file_name(sig, data.codegen)
         for folder in _folders():
             if _written(folder / name, hashlib.sha256(content).digest() + content):
                 return
