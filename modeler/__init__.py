@@ -45,38 +45,38 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from modeler.api import Result, build, register
-    from modeler.pipeline import Modeler
-    from modeler.priors import (
-        FeaturesPrior,
-        GeneralPrior,
-        HeldPrior,
-        PokePrior,
-        ProductPrior,
-        TablePrior,
-        TurntablePrior,
-        VelocityPrior,
-    )
-    from modeler.registration import VisibilityRegistrar
-    from modeler.runs.known_objects import KnownObject, known_object
-    from modeler.segmentation import Segmenter
-    from modeler.sequences import open_sequence
-    from modeler.tracking import Tracked, Tracker
-    from modeler.types import (
-        Camera,
-        Frame,
-        InputError,
-        ObjectModel,
-        Outcome,
-        PoseGaussian,
-        Posterior,
-        SensorNoise,
-        Solution,
-        Step,
-        Verdict,
-    )
-    from modeler.views import Sensor
-    from modeler.viz.stream import open_stream
+    from modeler.api import Result as Result
+    from modeler.api import build as build
+    from modeler.api import register as register
+    from modeler.pipeline import Modeler as Modeler
+    from modeler.priors import FeaturesPrior as FeaturesPrior
+    from modeler.priors import GeneralPrior as GeneralPrior
+    from modeler.priors import HeldPrior as HeldPrior
+    from modeler.priors import PokePrior as PokePrior
+    from modeler.priors import ProductPrior as ProductPrior
+    from modeler.priors import TablePrior as TablePrior
+    from modeler.priors import TurntablePrior as TurntablePrior
+    from modeler.priors import VelocityPrior as VelocityPrior
+    from modeler.registration import VisibilityRegistrar as VisibilityRegistrar
+    from modeler.runs.known_objects import KnownObject as KnownObject
+    from modeler.runs.known_objects import known_object as known_object
+    from modeler.segmentation import Segmenter as Segmenter
+    from modeler.sequences import open_sequence as open_sequence
+    from modeler.tracking import Tracked as Tracked
+    from modeler.tracking import Tracker as Tracker
+    from modeler.types import Camera as Camera
+    from modeler.types import Frame as Frame
+    from modeler.types import InputError as InputError
+    from modeler.types import ObjectModel as ObjectModel
+    from modeler.types import Outcome as Outcome
+    from modeler.types import PoseGaussian as PoseGaussian
+    from modeler.types import Posterior as Posterior
+    from modeler.types import SensorNoise as SensorNoise
+    from modeler.types import Solution as Solution
+    from modeler.types import Step as Step
+    from modeler.types import Verdict as Verdict
+    from modeler.views import Sensor as Sensor
+    from modeler.viz.stream import open_stream as open_stream
 
 _MODULES = {
     "modeler.api": ("Result", "build", "register"),
@@ -114,40 +114,7 @@ _MODULES = {
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = [
-    "Camera",
-    "FeaturesPrior",
-    "Frame",
-    "GeneralPrior",
-    "HeldPrior",
-    "InputError",
-    "KnownObject",
-    "Modeler",
-    "ObjectModel",
-    "Outcome",
-    "PokePrior",
-    "PoseGaussian",
-    "Posterior",
-    "ProductPrior",
-    "Result",
-    "Segmenter",
-    "Sensor",
-    "SensorNoise",
-    "Solution",
-    "Step",
-    "TablePrior",
-    "Tracked",
-    "Tracker",
-    "TurntablePrior",
-    "VelocityPrior",
-    "Verdict",
-    "VisibilityRegistrar",
-    "build",
-    "known_object",
-    "open_sequence",
-    "open_stream",
-    "register",
-]
+__all__ = tuple(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:

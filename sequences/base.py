@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from modeler.types import Array, Frame, InputError, SensorNoise
 
@@ -50,7 +50,7 @@ class AbstractSequence(ABC):
         return None
 
     @property
-    def motion(self) -> Mapping[str, object] | None:
+    def motion(self) -> Mapping[str, Any] | None:
         """Known motion, `{"kind": "turntable", "step_deg": 25, …}`; None if nothing is known."""
         return None
 
@@ -149,7 +149,7 @@ class AbstractDerived(AbstractSequence):
         return self.whole.sensor()
 
     @property
-    def motion(self) -> Mapping[str, object] | None:
+    def motion(self) -> Mapping[str, Any] | None:
         return self.whole.motion
 
     @property

@@ -138,23 +138,11 @@ def _next(camera: RunningCamera, number: int, after_s: float | None) -> Frame:
     raise InputError(f"{camera.name}: gives the same image again and again; reconnect it.")
 
 
-SCHEME = "realsense:"  # prefix of a path that selects a camera; its serial number may follow
-ADVICE = f"a RealSense camera is read by its maker's library; {install_command('realsense')}"
 WARM_UP = 30  # images after which exposure has settled
 TIMEOUT_MS = 5000  # a camera that gives nothing for so long is gone
 REACH_M = 16.0  # depth of a live camera beyond this is a measurement error; less fits 16 bits of a fine unit
 _TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")
 """Names of models that measure so; others see structured light or stereo pairs."""
-
-
-def open_camera(serial: str, overrides: Overrides, context: Any = None) -> LiveSequence:
-    """Start a camera."""
-    try:
-        library = importlib.import_module("pyrealsense2")
-    except ImportError:
-        raise InputError(f"{SCHEME}{serial}: {ADVICE}.") from None
-    camera = _started(library, serial, context)
-    return opened(camera, overrides, WARM_UP if context is None else 0)
 
 
 def opened(camera: RunningCamera, overrides: Overrides, warm_up: int = WARM_UP) -> LiveSequence:
@@ -174,14 +162,16 @@ def _check_present(rs: Any, context: Any, serial: str) -> None:
     """Refuse a camera that is not there, for which the library would wait long."""
     devices = list(context.query_devices())
     if not devices:
-        raise InputError(f"{SCHEME.removesuffix(':')}: no camera is plugged in; connect one to a USB 3 port.")
+        raise InputError("realsense: no camera is plugged in; connect one to a USB 3 port.")
     number = rs.camera_info.serial_number
     present = [device.get_info(number) for device in devices if device.supports(number)]
     if serial and serial not in present:
-        raise InputError(f"{SCHEME}{serial}: no such camera is plugged in; there is {', '.join(present) or 'another'}.")
+        raise InputError(
+            f"realsense:{serial}: no such camera is plugged in; there is {', '.join(present) or 'another'}."
+        )
 
 
-def _started(rs: Any, serial: str, context: Any) -> RunningCamera:
+def realsense(rs: Any, serial: str, context: Any = None) -> RunningCamera:
     """Start the RealSense camera with a serial number, or the only one."""
     try:
         context = rs.context() if context is None else context
@@ -200,7 +190,7 @@ def _started(rs: Any, serial: str, context: Any) -> RunningCamera:
         unit_mm = 1000.0 * device.first_depth_sensor().get_depth_scale()
         model = device.get_info(rs.camera_info.name) if device.supports(rs.camera_info.name) else "RealSense"
     except RuntimeError as error:
-        raise InputError(f"{SCHEME}{serial}: cannot be started ({in_a_line(error)}); reconnect it.") from None
+        raise InputError(f"realsense:{serial}: cannot be started ({in_a_line(error)}); reconnect it.") from None
 
     def newest() -> Image:
         frames = align.process(pipeline.wait_for_frames(TIMEOUT_MS))
@@ -346,6 +336,7 @@ def azure(k4a: Any, serial: str) -> RunningCamera:
 
 
 LIBRARIES: Final[Mapping[str, tuple[str, str, Callable[[Any, str], RunningCamera]]]] = {
+    "realsense": ("pyrealsense2", "realsense", realsense),
     "orbbec": ("pyorbbecsdk", "orbbec", orbbec),
     "oak": ("depthai", "oak", oak),
     "azure": ("pyk4a", "azure", azure),
@@ -353,7 +344,7 @@ LIBRARIES: Final[Mapping[str, tuple[str, str, Callable[[Any, str], RunningCamera
 """What stands before the colon of a path: the library, the extra that installs it, and what starts a camera."""
 
 
-def open_camera_of(maker: str, serial: str, overrides: Overrides) -> LiveSequence:
+def open_camera(maker: str, serial: str, overrides: Overrides) -> LiveSequence:
     """Start a camera."""
     module, extra, start = LIBRARIES[maker]
     try:

@@ -21,7 +21,7 @@ from modeler.sequences.image_folders import (
 )
 from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
-from modeler.sequences.live import LIBRARIES, SCHEME, open_camera, open_camera_of
+from modeler.sequences.live import LIBRARIES, open_camera
 from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.tum import open_tum
 from modeler.system.regular_files import check_regular
@@ -48,11 +48,9 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
     path, overrides = Path(path), overrides or Overrides()
     if not _is_text(path):
         raise InputError(f"{path}: its name is not UTF-8; rename it.")
-    if str(path).startswith(SCHEME):
-        return open_camera(str(path).removeprefix(SCHEME), overrides)
     maker, colon, serial = str(path).partition(":")
     if colon and maker in LIBRARIES and not path.exists():
-        return open_camera_of(maker, serial, overrides)
+        return open_camera(maker, serial, overrides)
     try:
         found = with_hand(_open(path, overrides))
         return AxialSequence(found) if overrides.along_ray else found

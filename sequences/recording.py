@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -83,7 +83,7 @@ class AbstractRecording(AbstractSequence):
         return by_format._replace(**values)
 
     @property
-    def motion(self) -> Mapping[str, object] | None:
+    def motion(self) -> Mapping[str, Any] | None:
         node = None if self._meta is None else self._meta.get("motion")
         return None if node is None else _motion(node)
 

@@ -198,7 +198,7 @@ def azure(shown: Shown) -> SimpleNamespace:
 STAND_INS = {"orbbec": orbbec, "oak": oak, "azure": azure}
 
 
-@pytest.fixture(params=LIBRARIES)
+@pytest.fixture(params=STAND_INS)
 def maker(request: pytest.FixtureRequest) -> str:
     return request.param
 

@@ -15,7 +15,7 @@ from modeler.cli import main
 from modeler.export import RunFolder
 from modeler.sequences import CalibratedSequence, NoiseModel, Overrides, open_sequence, survey
 from modeler.sequences.lens import Lens, lens_of_model
-from modeler.sequences.live import Image, RunningCamera, begin, open_camera
+from modeler.sequences.live import Image, RunningCamera, begin, opened, realsense
 from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
 from studies.formats.image_folders import raw_depth, small_frames
@@ -211,13 +211,13 @@ def test_a_camera_of_the_makers_library_is_read_while_it_runs(
     recording.record(rs, path, 14, pause_s=0.05)
     context = rs.context()
     with pytest.raises(InputError, match=r"realsense: no camera"):
-        open_camera("123", Overrides(), context)
+        realsense(rs, "123", context)
     played = context.load_device(str(path))
     with pytest.raises(InputError, match=r"realsense:123: .* 0123456789\."):
-        open_camera("123", Overrides(), context)
+        realsense(rs, "123", context)
     monkeypatch.setattr("modeler.sequences.live.TIMEOUT_MS", 500)
     monkeypatch.setattr("modeler.sequences.live.FIRST", 4)
-    sequence = open_camera("0123456789", Overrides(), context)
+    sequence = opened(realsense(rs, "0123456789", context), Overrides(), warm_up=0)
     assert (sequence.name, sequence.depth_unit) == ("Software D455", "0.25 mm (the camera)")
     frames: list[Frame] = []
     with pytest.raises(InputError, match=r"Software D455: gives no image"):

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, partial
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -35,17 +35,18 @@ _PULSE_S = 30.0  # between signs of life where there is no bar
 _ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
 
-def say(words: str, level: int = logging.INFO) -> None:
+def say(words: str, level: int = logging.INFO, show: Callable[[str], object] | None = None) -> None:
     """Print a one-line message; unprintable characters from inputs are escaped.
 
     Args:
         words: the message.
         level: ERROR is printed with `-q`, too, DEBUG only with `-v`.
+        show: prints it; None: to stderr.
     """
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(as_options(words).split()))
     if MESSAGES.note(line, level):
         with lost_without_harm():
-            print("modeler:", line, file=sys.stderr)
+            (show or partial(print, file=sys.stderr))(f"modeler: {line}")
 
 
 def as_options(words: str) -> str:
@@ -371,8 +372,8 @@ class Console:
         return f"{what}: {what_to_do}"
 
     def _say(self, text: str, level: int = logging.INFO) -> None:
-        line = as_options(text)
-        if MESSAGES.note(line, level):
-            self._said_s = time.monotonic()
-            with lost_without_harm():
-                self._bar.console.print(f"modeler: {line}", markup=False)
+        say(text, level, self._print)
+
+    def _print(self, line: str) -> None:
+        self._said_s = time.monotonic()
+        self._bar.console.print(line, markup=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import importlib
 import itertools
-import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +35,6 @@ from modeler.segmentation import Scene, Segmenter, scene_frames
 from modeler.sequences import AbstractSequence
 from modeler.sequences.file_names import said_of_angles
 from modeler.sequences.hand_shapes import hand_poses
-from modeler.sequences.input_files import frame_number
 from modeler.types import NOMINAL_FOCAL, AbstractPrior, AbstractRegistrar, InputError, SensorNoise
 from modeler.types.base import ParameterError
 from modeler.views import Sensor
@@ -210,9 +208,9 @@ def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
     enough: Mapping[str, Callable[[], object]] = {
         "general": lambda: True,
         "table": lambda: True,
-        "turntable": lambda: options.step_deg is not None or _number(motion.get("step_deg")),
+        "turntable": lambda: options.step_deg is not None or motion.get("step_deg"),
         "held": lambda: sequence is not None and sequence.robot_path is not None,
-        "poke": lambda: isinstance(motion.get("pokes"), dict),
+        "poke": lambda: "pokes" in motion,
     }
     # Parameters of another prior, given by hand, say more than the file.
     fits = options.parameters().keys() <= set(_GIVEN.get(kind, ()))
@@ -232,7 +230,7 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
     name, assumed = prior_name(options, sequence), []
     if options.prior is None and name not in ("auto", "general"):
         assumed.append(f"prior {name}, from sequence.json")
-    step_deg = _number((sequence.motion or {}).get("step_deg"))
+    step_deg = (sequence.motion or {}).get("step_deg")
     if "turntable" in name.split("+") and options.step_deg is None and step_deg is not None:
         assumed.append(f"step {step_deg:g}°, from sequence.json")
     step_deg = step_deg if options.step_deg is None else options.step_deg
@@ -260,9 +258,7 @@ def comes_back(frames: AbstractSequence, prior: AbstractPrior, reach_deg: float)
     """
     table = turntable_in(prior)
     step_deg = (frames.motion or {}).get("step_deg") if table is None else table.step_deg
-    if not isinstance(step_deg, int | float):
-        return False
-    return abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
+    return step_deg is not None and abs(step_deg) * (frames.indices[-1] - frames.indices[0]) >= 360.0 - reach_deg
 
 
 def _known(name: str, given: dict[str, Any], sequence: AbstractSequence | None) -> AbstractPrior:
@@ -336,19 +332,19 @@ def _literal(value: object) -> bool:
         return False
 
 
-def _turntable(given: dict[str, Any], motion: Mapping[str, object], indices: Sequence[int]) -> TurntablePrior:
+def _turntable(given: dict[str, Any], motion: Mapping[str, Any], indices: Sequence[int]) -> TurntablePrior:
     """Return a turntable, its step as given, else from `sequence.json`.
 
     A step given without an axis leaves its sign unknown, unless it is negative or agrees with the file.
     """
-    step_deg, sigma_deg = _number(motion.get("step_deg")), _number(motion.get("sigma_deg"))
+    step_deg, sigma_deg = motion.get("step_deg"), motion.get("sigma_deg")
     given = dict(given)
     if "step_deg" not in given:
         if not step_deg:
             looks = "".join(f" ({said})" for said in said_of_angles(indices))
             raise InputError(f"`prior` turntable needs the rotation from frame to frame; give `step_deg`{looks}")
         given["step_deg"] = step_deg
-        if sigma_deg is not None and sigma_deg > 0.0:
+        if sigma_deg:
             given.setdefault("step_sigma_deg", sigma_deg)
     agreed = step_deg is not None and step_deg * given["step_deg"] > 0.0
     signed = given["step_deg"] < 0.0 or "axis_direction" in given or agreed
@@ -378,40 +374,8 @@ def _poke(given: dict[str, Any], sequence: AbstractSequence | None) -> PokePrior
         if missing:
             raise InputError(f"`prior` poke needs `{missing[0]}` as well; give all three")
         return PokePrior(Poke(given["poke_point_m"], given["poke_direction"], given["poke_length_m"]))
-    pokes = None if sequence is None or sequence.motion is None else sequence.motion.get("pokes")
-    if sequence is None or not isinstance(pokes, dict) or not pokes:
+    pokes = None if sequence is None else (sequence.motion or {}).get("pokes")
+    if not pokes:
         raise InputError("`prior` poke needs `poke_point_m`, `poke_direction` and `poke_length_m`; give them")
-    return PokePrior(pokes=dict(_one_poke(f"{sequence.name}: sequence.json", *one) for one in pokes.items()))
-
-
-def _one_poke(where: str, frame: str, entry: object) -> tuple[int, Poke]:
-    """Return a push as `sequence.json` has it, and the first frame after it; `where` is for messages."""
-    number = frame_number(frame)
-    if number is None:
-        raise InputError(
-            f"{where}: poke {frame!r} must have a frame number as its key; use that of the first frame after it"
-        )
-    values = entry if isinstance(entry, dict) else {}
-    point_m, direction, length_m = (values.get(name) for name in ("point_m", "direction", "length_m"))
-    threes = [
-        tuple(map(_number, three)) if isinstance(three, list) and len(three) == 3 else (None,)
-        for three in (point_m, direction)
-    ]
-    length_m = _number(length_m)
-    if any(None in three for three in threes) or not any(threes[1]) or length_m is None or not 0.0 < length_m <= 10.0:
-        raise InputError(
-            f'{where}: poke {frame!r} must be {{"point_m": [x, y, z], "direction": [x, y, z], "length_m": l}} '
-            "in camera coordinates; correct it"
-        )
-    return number, Poke(threes[0], threes[1], length_m)  # pyright: ignore[reportArgumentType]
-
-
-def _number(value: object) -> float | None:
-    """Return a finite number; None if the value is none."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:  # whole numbers of a file may have any number of digits
-        return None
-    return number if math.isfinite(number) else None
+    read = {int(k): Poke(tuple(e["point_m"]), tuple(e["direction"]), e["length_m"]) for k, e in pokes.items()}
+    return PokePrior(pokes=read)

@@ -12,7 +12,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure import Closer, MapView
 from modeler.graph.focal import LIMIT_STEPS
-from modeler.priors import turntable_in
+from modeler.priors import PokePrior, turntable_in
 from modeler.priors.mixtures import Gaussian
 from modeler.registration import VisibilityLikelihood
 from modeler.registration.visibility.points import point_rows
@@ -303,8 +303,7 @@ class Belief:
         Variances below the noise of a single view are clipped: more precision is not needed.
         """
         after_m2 = 1.0 / (1.0 / before_m2 + 1.0 / measured_m2)
-        enough_m2 = self._noise_m2
-        return 0.5 * np.log(np.maximum(before_m2, enough_m2) / np.maximum(after_m2, enough_m2))
+        return 0.5 * np.log(np.maximum(before_m2, self._noise_m2) / np.maximum(after_m2, self._noise_m2))
 
     def brought(self, view: RayImage, object_from_camera: Array, covariance: Array) -> tuple[float, float]:
         """Return the realised gain of a view: `surface_nats`, and the new share of its surface.
@@ -403,7 +402,8 @@ class Belief:
         first = edge(self.last.index)
         if first is None:
             return ()
-        base = _posterior(predicted.image.index, first, self._relative(first.target, object_from_new))
+        pose = PoseGaussian(self._relative(first.target, object_from_new), first.covariance)
+        base = Posterior(predicted.image.index, first.target, pose, Outcome.CONVERGED, 1.0)
         others = [
             target for target in self.closer.closure_targets(base, self._map, last=True) if target != first.target
         ]
@@ -419,7 +419,7 @@ class Belief:
         if target.index != self.last.index:  # a closure, whose motion the graph predicts: only limits count
             prior = prior.relaxed(LIMIT_STEPS)
         elif candidate.poke is not None:
-            prior = candidate.poke_prior
+            prior = PokePrior(candidate.poke)
         try:
             return prior.between(source, target)
         except InputError:
@@ -437,10 +437,6 @@ def displacement_m2(points_m: Array, normals: Array, covariance: Array) -> Array
     """Return variances (n,) in m² along normals (n, 3) of points (n, 3) by a pose's error (6, 6), all in one frame."""
     levers = np.hstack([np.cross(points_m, normals), normals])
     return np.maximum(np.einsum("ni,ij,nj->n", levers, covariance, levers), 0.0)
-
-
-def _posterior(source: int, edge: PredictedEdge, mean: Array) -> Posterior:
-    return Posterior(source, edge.target, PoseGaussian(mean, edge.covariance), Outcome.CONVERGED, 1.0)
 
 
 def _spin_deg(covariances: Mapping[int, Array], up: Array) -> float:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from modeler import se3
-from modeler.priors import Poke, PokePrior
+from modeler.priors import Poke
 from modeler.priors.mixtures import across_axis
 from modeler.priors.poke import STEPS, pushed
 from modeler.suggestion.surface_cells import Stand
@@ -36,11 +36,6 @@ class Candidate:
     sigmas: tuple[float, float] | None = None
     """Standard deviations in rad and m with which the pose is reached; None: those of the run's prior."""
 
-    @property
-    def poke_prior(self) -> PokePrior:
-        """Prior of the motion given the push."""
-        return PokePrior(poke=self.poke)
-
     def motion(self, last: RayImage, stand: Stand, object_from_last: Array) -> Array:
         """Return new_from_last (4, 4), the expected motion of the object in the camera's coordinates."""
         if self.new_from_last is not None:
@@ -54,9 +49,9 @@ class Candidate:
         return last_from_object @ stand.turned(np.radians(self.turn_deg)) @ object_from_last
 
 
-def turns(step_deg: float, largest_deg: float) -> list[Candidate]:
-    """Return turns by multiples of a step, either way."""
-    counts = range(1, int(largest_deg / step_deg + 1e-9) + 1)
+def turns(step_deg: float) -> list[Candidate]:
+    """Return turns by multiples of a step, either way, up to half a turn."""
+    counts = range(1, int(180.0 / step_deg + 1e-9) + 1)
     return [Candidate("turn", turn_deg=sign * k * step_deg) for k in counts for sign in (1.0, -1.0)]
 
 

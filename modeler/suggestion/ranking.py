@@ -128,8 +128,8 @@ def _default(belief: Belief) -> list[Prediction]:
         belief, [*pokes(belief.last, belief.stand, belief.object_from_last), Candidate("lay", cost=_LYING_COST)]
     )
     if table is not None:
-        return others + _predicted(belief, turns(abs(table.step_deg), 180.0))
-    found = _predicted(belief, turns(_COARSE_DEG, 180.0))
+        return others + _predicted(belief, turns(abs(table.step_deg)))
+    found = _predicted(belief, turns(_COARSE_DEG))
     fine = [
         Candidate("turn", turn_deg=best.candidate.turn_deg + offset_deg)
         for sign in (1.0, -1.0)

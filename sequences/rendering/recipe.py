@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class Tabletop:
             if np.hypot(*there_m) <= self.reach_m:
                 return there_m
 
-    def motion(self) -> Mapping[str, object]:
+    def motion(self) -> Mapping[str, Any]:
         """Return its entry in `sequence.json`."""
         return {"kind": "table", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
 
@@ -92,7 +92,7 @@ class Turntable:
         poses = np.array([placement((0.0, 0.0, 0.0), (0.0, 0.0, turn_deg)) @ on_disc for turn_deg in turns_deg])
         return _wobbling(poses, self.wobble_deg, self.wobble_m, rng)
 
-    def motion(self) -> Mapping[str, object]:
+    def motion(self) -> Mapping[str, Any]:
         """Return its entry in `sequence.json`."""
         return {"kind": "turntable", "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg}
 
@@ -149,7 +149,7 @@ class Hand:
             poses.append(middle @ se3.translation(rng.normal(0.0, self.shift_m, 3)) @ turn @ about_centre)
         return np.array(poses)
 
-    def motion(self) -> Mapping[str, object]:
+    def motion(self) -> Mapping[str, Any]:
         """Return its entry in `sequence.json`."""
         kind = "general" if self.robot is None else "held"
         return {"kind": kind, "step_deg": self.step_deg, "sigma_deg": self.step_sigma_deg, "shift_m": self.shift_m}
@@ -179,7 +179,7 @@ class Places:
         """Return the poses (frames, 4, 4)."""
         return np.array([placement(pose.offset_m, pose.rotation_deg) for pose in self.poses])
 
-    def motion(self) -> Mapping[str, object] | None:
+    def motion(self) -> Mapping[str, Any] | None:
         """Return its entry in `sequence.json`: none."""
         return None
 

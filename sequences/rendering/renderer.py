@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -92,7 +93,7 @@ class RenderedSequence(AbstractSequence):
         return SensorNoise(*sigmas, float(np.hypot(shift_px, _ALIGNED_PX)), sigma_focal=0.0)
 
     @property
-    def motion(self) -> Mapping[str, object] | None:
+    def motion(self) -> Mapping[str, Any] | None:
         return self.recipe.trajectory.motion()
 
     def model(self) -> Mesh:

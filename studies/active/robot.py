@@ -7,6 +7,7 @@ from typing import Final, final
 
 import numpy as np
 
+from modeler.priors import PokePrior
 from modeler.sequences.rendering.recipe import Recipe
 from modeler.suggestion import Belief, Candidate
 from studies.table_stage import Stage
@@ -40,7 +41,7 @@ class SimulatedRobot:
         """
         if candidate.poke is not None:
             later = replace(belief.last, frame=replace(belief.last.frame, index=belief.last.index + 1))
-            density = candidate.poke_prior.between(belief.last, later)
+            density = PokePrior(candidate.poke).between(belief.last, later)
             return SimulatedRobot(self.stage.moved(density.sample(1, rng)[0]))
         if candidate.action != "turn":
             motion = candidate.motion(belief.last, belief.stand, belief.object_from_last)
