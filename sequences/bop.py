@@ -22,11 +22,9 @@ from modeler.sequences.image_files import (
     check_size,
     metres,
     no_depth,
-    object_and_occluder,
     read_colour,
     read_depth,
-    read_labels,
-    read_mask,
+    read_masks,
     write_image,
 )
 from modeler.sequences.input_files import Node, entries, first_folder, frame_number, is_there, read_tree
@@ -228,17 +226,9 @@ class BopSequence(AbstractRecording):
         """Return the masks (h, w) of object and occluder; None if there is no file."""
         stem = self._depth_paths[index].stem
         path = self.path / MASKS / f"{stem}_000000.png"
-        labels = read_labels(path) if is_there(path) else None
-        if labels is not None:
-            check_size(path, labels.shape, size)
         named = (self.path / OCCLUDERS / name for name in _occluder_names(stem))
         hand = next((one for one in named if is_there(one)), None)
-        occluder = None if hand is None else read_mask(hand)
-        if hand is not None and occluder is not None:
-            check_size(hand, occluder.shape, size)
-        if labels is None:
-            return None, occluder
-        return object_and_occluder(labels, occluder)
+        return read_masks(path if is_there(path) else None, hand, size)
 
     def _colour(self, index: int, size: tuple[int, ...]) -> npt.NDArray[np.uint8] | None:
         path = self._colour_paths.get(index)

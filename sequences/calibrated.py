@@ -16,8 +16,6 @@ from modeler.sequences.base import AbstractDerived
 from modeler.sequences.input_files import Node, read_tree
 from modeler.types import NOMINAL_FOCAL, Array, Camera, Frame, InputError, SensorNoise
 
-MAX_ANGLE_RAD = np.radians(85.0)  # beyond, the model's noise would grow without bounds and is kept constant
-
 
 @dataclass(frozen=True)
 class NoiseModel:
@@ -67,7 +65,7 @@ class NoiseModel:
 
 def slope_terms(distance_m: Array, angle_rad: Array) -> Array:
     """Return the regressors (..., 4) of the variance along the ray: 1, z⁴, z⁴ q, z⁴ q²."""
-    angle = np.minimum(np.abs(angle_rad), MAX_ANGLE_RAD)
+    angle = np.minimum(np.abs(angle_rad), np.radians(85.0))  # beyond, the noise would grow without bounds
     slope = (angle / (0.5 * np.pi - angle)) ** 2
     fourth, slope = np.broadcast_arrays(np.asarray(distance_m) ** 4, slope)
     return np.stack([np.ones_like(fourth), fourth, fourth * slope, fourth * slope**2], axis=-1)
@@ -241,9 +239,7 @@ class AxialSequence(AbstractDerived):
 
 
 _POINTS: Final = 4000  # of a frame: shares are then known to 1 %
-_TRIALS: Final = 150  # of three points: a plane with a third of all is found with a probability of 99.6 %
 _NEAR: Final = 0.008  # relative residual of a plane; cameras measure 0.5 m and 2 m to half of that
-_LEAST_PIXELS: Final = 500  # fewer tell of no plane
 
 
 def flat_shares(frames: Sequence[Frame]) -> tuple[float, float]:
@@ -262,7 +258,7 @@ def flat_shares(frames: Sequence[Frame]) -> tuple[float, float]:
 def _flat_shares(frame: Frame) -> tuple[float, float] | None:
     measured = np.isfinite(frame.depth_m) & (frame.depth_m > 0.0)
     places = np.flatnonzero(measured)[:: max(1, np.count_nonzero(measured) // _POINTS)]
-    if len(places) < _LEAST_PIXELS:
+    if len(places) < 500:  # fewer tell of no plane
         return None
     w, h = (np.ascontiguousarray(each).ravel()[places] for each in frame.camera.rays())
     inverse = 1.0 / frame.depth_m.ravel()[places].astype(np.float64)
@@ -277,7 +273,8 @@ def _largest_plane(w: Array, h: Array, inverse: Array) -> float:
     rng = np.random.default_rng(0)
     design = np.stack([w, h, np.ones_like(w)], axis=1)
     best = np.zeros(len(w), dtype=np.bool_)
-    for three in rng.integers(0, len(w), (_TRIALS, 3)):
+    # So many triples find a plane with a third of all points with a probability of 99.6 %.
+    for three in rng.integers(0, len(w), (150, 3)):
         if abs(np.linalg.det(design[three])) < 1e-6:
             continue
         near = np.abs(design @ np.linalg.solve(design[three], inverse[three]) / inverse - 1.0) < _NEAR

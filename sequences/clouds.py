@@ -26,10 +26,8 @@ from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import Array, Camera, Frame, InputError
 
 SUFFIXES = (".pcd", ".ply")
-MAX_OFF_PX = 1.0  # points that lie farther (half of them) from their pixels were not seen by a pinhole camera
 _HEADER_BYTES = 65536  # more than headers take, comments included
 _MOST_BYTES = 1000  # a point, as text with many fields
-_LZF_RATIO = 20  # points a byte: its longest match is 264 bytes in 3, and a point has 6 at the least
 
 
 @dataclass(frozen=True)
@@ -128,7 +126,7 @@ def _plausible_axes(points: npt.NDArray[np.float64]) -> list[Axes]:
     found = list[Axes]()
     for axes, rotation in _CAMERA_FROM.items():
         forward = points @ rotation[2]
-        if np.count_nonzero(forward > _LEAST_Z) > _BEFORE * max(np.count_nonzero(forward < -_LEAST_Z), 1):
+        if np.count_nonzero(forward > _LEAST_Z) > 100 * max(np.count_nonzero(forward < -_LEAST_Z), 1):
             found.append(axes)
     return found if "camera" in found else [*found, "camera"]
 
@@ -158,7 +156,6 @@ def _intrinsics(
 
 
 _LEAST_Z = 1e-9  # in any unit: nearer is the camera itself
-_BEFORE = 100  # times as many points before the camera as behind it
 
 
 def _unit_mm(cloud: _Cloud, overrides: Overrides) -> tuple[float, str]:
@@ -187,7 +184,7 @@ def _slopes(points: npt.NDArray[np.float64]) -> Array:
     """Return x/z and y/z (n, 2) of the points (n, 3) before the camera."""
     points = points[points[:, 2] > _LEAST_Z]
     slopes = points[:, :2] / points[:, 2:]
-    return slopes[(np.abs(slopes) < _STEEPEST).all(axis=1)]
+    return slopes[(np.abs(slopes) < 1e3).all(axis=1)]  # no camera sees so far to the side
 
 
 def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
@@ -201,11 +198,8 @@ def _on_a_grid(slopes: Array, path: Path) -> Intrinsics:
     return fx, fy, cx, cy
 
 
-_STEEPEST = 1e3  # no camera sees so far to the side
 _FINEST_PX, _COARSEST_PX = 5000.0, 50.0  # focal lengths between which grids are looked for
 _BINS = 1 << 18  # four to a pixel of the finest grid, over slopes of 13
-_ON_GRID = 0.7  # of the largest possible power; of points anywhere it is a few hundredths
-_OFF_GRID_PX = 0.12  # median, 0.25 if they lie anywhere
 
 
 def _steps(slopes: Array) -> tuple[float, float]:
@@ -221,7 +215,8 @@ def _steps(slopes: Array) -> tuple[float, float]:
     power = np.abs(np.fft.rfft(histogram, _BINS)) / len(slopes)
     per_bin = 4.0 * _FINEST_PX / _BINS
     start, stop = round(_COARSEST_PX / per_bin), round(_FINEST_PX / per_bin)
-    high = np.flatnonzero(power[start:stop] > _ON_GRID)
+    # Of the largest possible power; of points anywhere it is a few hundredths.
+    high = np.flatnonzero(power[start:stop] > 0.7)
     if not high.size:
         return 0.0, 0.0
     width = max(1, round(0.5 / ((values[-1] - values[0]) * per_bin)))
@@ -234,7 +229,7 @@ def _steps(slopes: Array) -> tuple[float, float]:
         whole = np.rint(slopes * factor + offset)
         (factor, offset), *_ = np.linalg.lstsq(np.stack([slopes, np.ones_like(slopes)], axis=1), whole, rcond=None)
     off_px = float(np.median(np.abs(slopes * factor + offset - np.rint(slopes * factor + offset))))
-    return (float(factor), float(offset)) if off_px < _OFF_GRID_PX else (0.0, 0.0)
+    return (float(factor), float(offset)) if off_px < 0.12 else (0.0, 0.0)  # 0.25 if they lie anywhere
 
 
 def _window(
@@ -293,7 +288,8 @@ def organised(path: Path) -> tuple[int, int]:
             f"{path}: is not organised as an image of columns and rows; save the camera's cloud as it comes "
             "(PCD with WIDTH and HEIGHT, PLY with obj_info num_cols and num_rows), or its depth image."
         )
-    least = points // _LZF_RATIO if "binary_compressed" in stop[0] else 2 * points
+    # LZF's longest match is 264 bytes in 3, and a point has 6 at the least.
+    least = points // 20 if "binary_compressed" in stop[0] else 2 * points
     if size < stop.end() + least:
         raise InputError(f"{path}: is cut off, or has fewer points than its header says; save it again.")
     if size > stop.end() + _MOST_BYTES * points:
@@ -325,7 +321,7 @@ def _fitted(points: npt.NDArray[np.float64], pixels: npt.NDArray[np.float64], pa
         found.append(line)
         off_px.append(float(np.median(np.abs(design @ line - pixels[seen, axis]))))
     (fx, cx), (fy, cy) = ((float(slope), float(start)) for slope, start in found)
-    if max(off_px) > MAX_OFF_PX or not sane((fx, fy, cx, cy)):
+    if max(off_px) > 1.0 or not sane((fx, fy, cx, cy)):  # no pinhole camera saw these points
         raise InputError(
             f"{path}: its points are not on the rays of a pinhole camera (off by {max(off_px):.1f} px); save them in "
             "camera coordinates (x right, y down, z forward), or give `intrinsics` FX FY CX CY."

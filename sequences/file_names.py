@@ -52,14 +52,14 @@ def said_of_angles(numbers: Iterable[int]) -> tuple[str, ...]:
     """Say so if frame numbers look like a turntable's angles in degrees: equal steps around a whole turn."""
     places = sorted(numbers)
     step = math.gcd(*(after - before for before, after in itertools.pairwise(places)))
-    if not 1 < step <= _WIDEST_STEP or places[-1] - places[0] not in (360 - step, 360) or 360 % step:
+    # Views farther apart share no surface.
+    if not 1 < step <= 90 or places[-1] - places[0] not in (360 - step, 360) or 360 % step:
         return ()
     return (
         f"frame numbers look like angles, in steps of {step}°; if they are, give `prior` turntable and `step_deg` 1",
     )
 
 
-_WIDEST_STEP: Final = 90  # degrees: views that are farther apart have no surface in common
 _STAMP_DIGITS: Final = 10  # of seconds since 1970, the shortest stamp
 _STAMP: Final = re.compile(
     r"(?<![0-9])(1[0-9]{9}|1[0-9]{12}|1[0-9]{15}|1[0-9]{18}|6[0-9]{17})(?![0-9])(?:[._]([0-9]{1,9}))?"

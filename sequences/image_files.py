@@ -177,14 +177,24 @@ def graded(path: Path) -> bool:
     return is_soft(_mask_pixels(path)[0])
 
 
-def object_and_occluder(
-    labels: npt.NDArray[np.uint8], occluder: BoolArray | None
-) -> tuple[BoolArray, BoolArray | None]:
-    """Return the masks (h, w) of an object and of its occluder; None if not given."""
+def read_masks(
+    mask: Path | None, occluder: Path | None, depth: tuple[int, ...]
+) -> tuple[BoolArray | None, BoolArray | None]:
+    """Return the masks (h, w) of an object and of its occluder, of which the object's may show some; None without.
+
+    `depth` (h, w) is the size of their depth image.
+    """
+    hidden = None if occluder is None else read_mask(occluder)
+    labels = None if mask is None else read_labels(mask)
+    for path, image in ((mask, labels), (occluder, hidden)):
+        if path is not None and image is not None:
+            check_size(path, image.shape, depth)
+    if labels is None:
+        return None, hidden
     marked = labels == OCCLUDED
     if not marked.any():
-        return labels != 0, occluder
-    return (labels != 0) & ~marked, marked if occluder is None else marked | occluder
+        return labels != 0, hidden
+    return (labels != 0) & ~marked, marked if hidden is None else marked | hidden
 
 
 def read_colour(path: Path | EmbeddedImage) -> npt.NDArray[np.uint8]:
@@ -352,9 +362,6 @@ def depth_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-_SMOOTHER: Final = 4.0  # times rougher: bytes in the right order never are
-
-
 def is_swapped(raw: RawDepth) -> bool:
     """Return whether whole numbers have their two bytes exchanged: neighbours are much more alike once they are not."""
     if raw.dtype != np.uint16:
@@ -365,7 +372,7 @@ def is_swapped(raw: RawDepth) -> bool:
         both = (left > 0) & (right > 0)
         return float(np.abs(left - right)[both].mean()) if both.any() else 0.0
 
-    return roughness(raw) > _SMOOTHER * roughness(raw.byteswap()) > 0.0
+    return roughness(raw) > 4.0 * roughness(raw.byteswap()) > 0.0  # times rougher: bytes in the right order never are
 
 
 def float_unit_mm(raw: RawDepth) -> float | None:

@@ -32,11 +32,10 @@ from modeler.sequences.image_files import (
     is_swapped,
     metres,
     no_depth,
-    object_and_occluder,
     read_colour,
     read_depth,
-    read_labels,
     read_mask,
+    read_masks,
     resize_to_depth,
 )
 from modeler.sequences.input_files import (
@@ -143,12 +142,8 @@ class ImageFolderSequence(AbstractRecording):
         check_same_size(
             files.depth, raw.shape, self._first, "and one camera took them all; convert each size by itself"
         )
-        labels = None if files.mask is None else read_labels(files.mask)
-        occluder = None if files.occluder is None else read_mask(files.occluder)
+        mask, occluder = read_masks(files.mask, files.occluder, raw.shape)
         colour = None if files.colour is None else read_colour(files.colour)
-        for path, image in ((files.mask, labels), (files.occluder, occluder)):
-            if path is not None and image is not None:
-                check_size(path, image.shape, raw.shape)
         if self.video is not None:
             colour = self.video.image(index)
         if colour is not None:
@@ -158,7 +153,6 @@ class ImageFolderSequence(AbstractRecording):
             trusted = read_mask(files.confidence)
             check_size(files.confidence, trusted.shape, raw.shape)
             depth_m[~trusted] = np.nan
-        mask, occluder = (None, occluder) if labels is None else object_and_occluder(labels, occluder)
         lens, camera = self._lens, self._lens.camera
         if files.intrinsics is not None:
             camera = Camera(camera.width, camera.height, *files.intrinsics)

@@ -233,14 +233,11 @@ def read_tree(path: Path) -> Node:
     raise InputError(f"{path}: is not valid {kind} ({why}); correct it there.")
 
 
-_MOST_YAML = 1_000_000  # characters; cameras take one or two thousand, and the parser a minute for this many
-
-
 def _from_yaml(text: str) -> object:
     """Parse YAML, also OpenCV's, which states version and types in ways of its own."""
     from ruamel.yaml import YAML  # takes 30 ms
 
-    if len(text) > _MOST_YAML:
+    if len(text) > 1_000_000:  # the parser takes a minute for so many characters; cameras take two thousand
         raise ValueError("it is larger than files of cameras are")
     text = re.sub(r"\A%YAML:.*\n", "", text.lstrip())
     try:

@@ -187,7 +187,8 @@ def _from_text(path: Path) -> CameraFacts:
     if len(numbers) == 1 and len(numbers[0]) >= 4:
         fx, fy, cx, cy = numbers[0][:4]
         found = (fx, fy, cx, cy) if sane((fx, fy, cx, cy)) else None
-        if len(numbers[0]) - 4 in (4, 5, 8) and max(map(abs, numbers[0][4:])) < _MAX_COEFFICIENT:
+        # Widths and heights, which may stand there, are larger.
+        if len(numbers[0]) - 4 in (4, 5, 8) and max(map(abs, numbers[0][4:])) < 100.0:
             distortion = tuple(numbers[0][4:])
     elif numbers and {len(numbers)} == {len(row) for row in numbers} <= {3, 4}:
         found = of_matrix(np.array(numbers)[:3, :3])
@@ -198,7 +199,6 @@ def _from_text(path: Path) -> CameraFacts:
     return CameraFacts(found, path.name, distortion=distortion)
 
 
-_MAX_COEFFICIENT = 100.0  # of distortion; widths and heights, which may stand there, are larger
 _SCALES = ("depth_scale", "DepthMapFactor", "depth_unit_scale_factor")
 _WIDTHS, _HEIGHTS = ("width", "w", "image_width", "Camera.width"), ("height", "h", "image_height", "Camera.height")
 
@@ -275,7 +275,7 @@ def _distortion(node: Node) -> tuple[float, ...]:
         entry = entry if (data := entry.get("data")) is None else data
     if entry is not None and isinstance(entry.value, list):
         found = [number for each in entry.elements() for number in (each.elements() if _is_row(each) else [each])]
-        return tuple(number.number() for number in found[:_MOST_COEFFICIENTS])
+        return tuple(number.number() for number in found[:14])  # as many as OpenCV has
     node = node if entry is None else entry
     if not isinstance(node.value, dict):
         return ()
@@ -286,9 +286,6 @@ def _distortion(node: Node) -> tuple[float, ...]:
     names = _FISHEYE_BY_NAME if fisheye else _BY_NAME
     values = (node.get(f"{prefix}{name}") for name in names)
     return tuple(0.0 if value is None else value.number() for value in values)
-
-
-_MOST_COEFFICIENTS = 14  # as many as OpenCV has
 
 
 def _is_row(node: Node) -> bool:

@@ -86,7 +86,6 @@ _BROWN = ("plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_c
           "radtan", "radial_tangential", "opencv", "pinhole", "perspective", "none", "")  # fmt: skip
 """RealSense's library projects by one formula in its three models of Brown and Conrady, to 0.02 px."""
 _FISHEYE = ("equidistant", "fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "equi")
-_BROWN_COUNT = 8  # k1 to k6, p1 and p2; thin prisms and tilted sensors are not modelled
 
 
 def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where: str) -> Lens:
@@ -95,7 +94,8 @@ def lens_of_model(camera: Camera, distortion: Sequence[float], model: str, where
     if name in _FISHEYE and len(values) <= 4:
         return Lens(camera, values, fisheye=True)
     found = Lens(camera, values)
-    if found.is_distorted and (name not in _BROWN or len(values) > _BROWN_COUNT):
+    # Thin prisms and tilted sensors are not modelled.
+    if found.is_distorted and (name not in _BROWN or len(values) > 8):
         raise InputError(
             f"{where}: its distortion model {model!r} with {len(values)} coefficients is not known; "
             "use rectified images."
@@ -111,9 +111,6 @@ def coefficients(values: Sequence[float]) -> tuple[float, ...]:
     return tuple(numbers)
 
 
-OCCLUSION_SHARE = 0.02  # relative depth behind the nearest surface from which on a point counts as occluded
-
-NEIGHBOUR_M = 0.02  # occluded pixels take the colour of the nearest visible surface within this distance
 STRIDE = 3  # stride over the visible points in that search
 
 
@@ -163,7 +160,7 @@ class Alignment:
         cell = int(np.ceil(2.0 * max(1.0, self.colour.camera.fx / self.depth.fx)))
         nearest = np.full((self.colour.camera.height // cell + 1, self.colour.camera.width // cell + 1), np.inf)
         np.minimum.at(nearest, (v // cell, u // cell), z)
-        return z <= nearest[v // cell, u // cell] * (1.0 + OCCLUSION_SHARE)
+        return z <= nearest[v // cell, u // cell] * (1.0 + 0.02)
 
 
 def _nearest_colours(
@@ -173,7 +170,7 @@ def _nearest_colours(
     lenders = np.flatnonzero(seen)[::STRIDE]
     if not lenders.size or seen.all():
         return np.zeros((np.count_nonzero(~seen), 3), np.uint8)
-    found = KDTree(points_m[lenders]).query(points_m[~seen], distance_upper_bound=NEIGHBOUR_M)
+    found = KDTree(points_m[lenders]).query(points_m[~seen], distance_upper_bound=0.02)  # m
     distance_m, places = np.asarray(found[0]), np.asarray(found[1])
     near = np.isfinite(distance_m)
     borrowed = np.zeros((len(places), 3), np.uint8)

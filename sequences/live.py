@@ -23,9 +23,6 @@ from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, Camera, Fr
 FIRST = 10  # number of frames taken before the sequence is described
 
 
-MAX_REPEATS = 100  # largest number of repetitions of one image
-
-
 Image = tuple[float, npt.NDArray[np.uint16], npt.NDArray[np.uint8] | None]
 """Time in s, raw depth (h, w), and colour (h, w, 3) of the depth camera's pixels, if there is any."""
 
@@ -129,7 +126,7 @@ def begin(camera: RunningCamera, first: int | None = None) -> LiveSequence:
 
 def _next(camera: RunningCamera, number: int, after_s: float | None) -> Frame:
     """Return the first image that is not the one of `after_s` again, as it may come with another colour image."""
-    for _ in range(MAX_REPEATS):
+    for _ in range(100):
         time_s, raw, colour = camera.take()
         if time_s != after_s:
             lens = camera.lens

@@ -16,8 +16,6 @@ from modeler.types import Array, BoolArray, Camera, InputError
 
 REACH = 4  # pixels on either side of a border that must belong to the near and to the far thing
 MIN_JUMP = 0.03  # least step of depth at a border, as a share of the depth
-LARGEST_STEP_PX = 1.5  # largest step of an edge from row to row in px
-WIDEST_SHADOW_PX = 60  # a near thing that is followed by nothing for longer is not known to have a border there
 STEEPEST = 1.5
 """Columns a row; steeper borders are measured along the other axis alone, those about the diagonal along both."""
 WINDOW = 9  # rows over which a border is compared with a smooth curve
@@ -94,7 +92,7 @@ def _following(middle_m: Array) -> Array:
     places = np.where(np.isfinite(middle_m), np.arange(middle_m.shape[1]), middle_m.shape[1] - 1)
     following = np.minimum.accumulate(places[:, ::-1], axis=1)[:, ::-1]
     found = np.take_along_axis(middle_m, following, axis=1)
-    return np.where(following - np.arange(middle_m.shape[1]) <= WIDEST_SHADOW_PX, found, np.nan)
+    return np.where(following - np.arange(middle_m.shape[1]) <= 60, found, np.nan)  # px: no shadow is wider
 
 
 def _chains(positions: Array, rows: int) -> list[Array]:
@@ -106,7 +104,7 @@ def _chains(positions: Array, rows: int) -> list[Array]:
         free, going = list(row), []
         for chain in open_chains:
             last = chain[-1]
-            near = [i for i, one in enumerate(free) if abs(one[1] - last[1]) <= LARGEST_STEP_PX]
+            near = [i for i, one in enumerate(free) if abs(one[1] - last[1]) <= 1.5]  # px
             near = [i for i in near if abs(free[i][3] - last[3]) <= MIN_JUMP * last[3]]
             if near:
                 chain.append(free.pop(min(near, key=lambda i: abs(free[i][1] - last[1]))))
@@ -136,9 +134,6 @@ def _measured(chain: Array, frames: int) -> list[DepthEdge]:
 
 HALF = 3  # half width of the window of the quadric fit in px
 MAX_BEND = 0.05  # where neighbours differ by more than this share of the depth, there is no surface
-DISTANCE_STEP = 1.15  # ratio of the ends of a class of distances
-ANGLE_STEP_RAD = np.radians(10.0)  # width of a class of angles
-MIN_PIXELS = 200  # classes with fewer pixels say nothing
 STEEPEST_RAD = np.radians(80.0)  # steeper surfaces are not measured: the quadric spans too much of them
 
 
@@ -227,12 +222,12 @@ def _quadric() -> tuple[Array, Array, Array, float]:
 
 def _pooled(distance_m: Array, angle_rad: Array, varies: Array, stays: Array) -> list[NoiseBin]:
     """Return the mean variance of each class; the wildest pixels of a class, which are no noise, are left out."""
-    near = np.floor(np.log(distance_m) / np.log(DISTANCE_STEP)).astype(np.int64)
-    tilt = np.floor(angle_rad / ANGLE_STEP_RAD).astype(np.int64)
+    near = np.floor(np.log(distance_m) / np.log(1.15)).astype(np.int64)
+    tilt = np.floor(angle_rad / np.radians(10.0)).astype(np.int64)
     found = []
     for key in np.unique(np.stack([near, tilt], axis=1), axis=0):
         inside = (near == key[0]) & (tilt == key[1]) & (angle_rad < STEEPEST_RAD)
-        if np.count_nonzero(inside) < MIN_PIXELS:
+        if np.count_nonzero(inside) < 200:  # too few to say anything
             continue
         variance = _calm_mean(varies[inside]) + max(_calm_mean(stays[inside]), 0.0)
         if variance > 0.0:
@@ -244,10 +239,6 @@ def _pooled(distance_m: Array, angle_rad: Array, varies: Array, stays: Array) ->
 def _calm_mean(values: Array) -> float:
     limit = 16.0 * max(float(np.mean(np.sort(values)[: int(0.9 * values.size)])), 1e-12)
     return float(values[values < limit].mean())
-
-
-MOST_FRAMES = 40  # more frames of a still scene add little
-MAX_MOVING = 0.02  # share of the pixels that may change by more than noise
 
 
 @dataclass(frozen=True)
@@ -264,7 +255,7 @@ class Calibration:
 
 def calibrate(sequence: AbstractSequence) -> Calibration:
     """Measure the noise of the camera that took a sequence."""
-    indices = sequence.indices[:MOST_FRAMES]
+    indices = sequence.indices[:40]  # more frames of a still scene add little
     if len(indices) < 3:
         raise InputError(f"{sequence.name}: has {len(indices)} frames; record at least 3, better 10, of a still scene.")
     frames = [sequence.frame(index) for index in indices]
@@ -279,7 +270,7 @@ def calibrate(sequence: AbstractSequence) -> Calibration:
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels without any measurement
         middle_m = np.where(seen, np.nanmedian(depth_m, axis=0), np.nan)
     moving = moving_share(depth_m, middle_m)
-    if moving > MAX_MOVING:
+    if moving > 0.02:
         raise InputError(
             f"{sequence.name}: {moving:.0%} of the image moves; record a scene in which camera and things stand still."
         )

@@ -36,15 +36,11 @@ IN_MIDDLE = 0.04
 """Within such a share calibrated cameras have it. Cut-out images may have it anywhere: only there, once exchanged or
 scaled to the images, is an error plain."""
 USUAL_FIELD_DEG = (1.0, 135.0)  # fields of view of depth cameras, crops included
-WIDEST_FIELD_DEG = 170.0  # no pinhole camera sees more
 BENT = 1.5
 """Ratio of the shares on a plane from which depth is the distance along the ray: 2 to 6 in scenes with a table."""
-LEAST_FLAT = 0.15  # least share of the pixels that such a plane has
 INSPECTED = 6  # number of frames, spread over the sequence, whose planes and edges are looked at
-_SIGMA_OF_SECOND_DIFFERENCES = 1.0 / (0.6745 * 6.0**0.5)  # times their median size: weights 1, -2 and 1
 LEAST_JOINED = 0.3
 """Depth cameras measure whole areas; where fewer pixels have measured neighbours, it is lines or single points."""
-MOST_NOISE = 0.008  # scatter as a share of depth. A Kinect 1 at 3 m, the noisiest camera measured, has 0.4 %.
 
 
 @dataclass(frozen=True)
@@ -113,7 +109,7 @@ class Survey:
         unit_is_sure = self.unit == "m" or any(source in self.unit for source in SURE_UNITS)
         if not (unit_is_sure or PLAUSIBLE_M[0] <= self.range_m[1] <= PLAUSIBLE_M[1]):
             found.append(_on_unit(self.range_m[1]))
-        if ray > max(LEAST_FLAT, BENT * axis):
+        if ray > max(0.15, BENT * axis):  # 15 % of the pixels at least
             found.append(
                 f"depth is the distance along the ray, as renderers write it: so {ray:.0%} of it lie on one plane, "
                 f"along the optical axis {axis:.0%}; give `along_ray`"
@@ -150,7 +146,7 @@ class Survey:
                 break
         doubts += [words for camera in self.cameras[:1] for words, _ in _on_principal_point(camera)]
         doubts += [error for error in self.plain_errors if error not in doubts]
-        if self.noise > MOST_NOISE:
+        if self.noise > 0.008:  # a Kinect 1 at 3 m, the noisiest camera measured, has 0.4 %
             doubts.append(
                 f"depth scatters by {self.noise:.1%} of the distance from pixel to pixel, more than cameras do: was it "
                 "compressed with loss, interpolated, or estimated from colour? Poses and model will be coarse"
@@ -247,7 +243,7 @@ def field_of_view_deg(size_px: int, focal_px: float) -> float:
 def _checked(sequence: AbstractSequence, camera: Camera) -> Camera:
     """Return a camera that can be one."""
     for name, focal_px, size_px in (("fx", camera.fx, camera.width), ("fy", camera.fy, camera.height)):
-        if field_of_view_deg(size_px, focal_px) > WIDEST_FIELD_DEG:
+        if field_of_view_deg(size_px, focal_px) > 170.0:  # no pinhole camera sees more
             raise InputError(
                 f"{sequence.name}: {name} of {focal_px:g} px is no focal length for images of {camera.width} x "
                 f"{camera.height}; correct the intrinsics, which are in px, or convert with `intrinsics` FX FY CX CY."
@@ -267,7 +263,8 @@ def _scatter(depth_m: Float32Array) -> float:
     bent = inverse[:, 2:] + inverse[:, :-2] - 2.0 * inverse[:, 1:-1]
     share = np.abs(bent / inverse[:, 1:-1])
     share = share[np.isfinite(share)]
-    return float(np.median(share)) * _SIGMA_OF_SECOND_DIFFERENCES if share.size else 0.0
+    # Differences of weights 1, -2 and 1 have √6 times the deviation of a pixel, and a median size of 0.6745 of that.
+    return float(np.median(share)) * (1.0 / (0.6745 * 6.0**0.5)) if share.size else 0.0
 
 
 def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:

@@ -17,10 +17,8 @@ from modeler.sequences.intrinsics import CameraFacts, Overrides, find_intrinsics
 from modeler.sequences.recording import paired
 from modeler.types import Array, InputError
 
-UNIT_MM = 0.2  # the benchmark stores 5000 units per metre
 CALIBRATION = (525.0, 525.0, 319.5, 239.5)
 """Intrinsics recommended by the benchmark for its images of 640 x 480, which come without intrinsics."""
-MAX_GAP_S = 0.2  # ground truth is not interpolated over longer gaps
 
 
 def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
@@ -61,7 +59,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
         found = CameraFacts(CALIBRATION, "the benchmark")
         remarks.append("no intrinsics: the benchmark's default of 525 525 319.5 239.5 px is assumed")
     remarks += found.remarks((width, height))
-    unit_mm, who = found.unit(overrides, (UNIT_MM, "the benchmark's, 5000 per m"))
+    unit_mm, who = found.unit(overrides, (0.2, "the benchmark's, 5000 per m"))
     return ImageFolderSequence(
         path,
         files=files,
@@ -106,7 +104,7 @@ def _tum_truth(path: Path, times_s: Sequence[float]) -> dict[int, Array] | None:
         after = int(np.searchsorted(stamps, time_s))
         if after < len(stamps) and stamps[after] == time_s:
             found[index] = se3.inverse(known[after][1])
-        elif 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= MAX_GAP_S:
+        elif 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= 0.2:  # s
             (before_s, before), (after_s, behind) = known[after - 1], known[after]
             share = (time_s - before_s) / (after_s - before_s)
             found[index] = se3.inverse(before @ se3.exp(share * se3.log(se3.inverse(before) @ behind)))

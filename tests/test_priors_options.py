@@ -90,7 +90,6 @@ TURNTABLE = Telling({"kind": "turntable", "step_deg": 25, "sigma_deg": 3})
         ({"kind": "table"}, {"max_offset_m": 0.1}, "general"),
         ({"kind": "table"}, {"prior": "general"}, "general"),
         ({"kind": "turntable", "step_deg": 25}, {}, "turntable"),
-        ({"kind": "turntable", "step_deg": "25"}, {}, "auto"),
         ({"kind": "turntable"}, {}, "auto"),
         ({"kind": "turntable"}, {"step_deg": 24.0}, "turntable"),
         ({"kind": "held"}, {}, "general"),

@@ -138,7 +138,6 @@ def _words() -> rrb.Container:
 
 
 def _readings() -> list[rrb.View]:
-    """Return one plot for each reading."""
     titles = {
         entities.TURNED: "Turned by [°]",
         entities.OVERLAP: "Overlap [%]",

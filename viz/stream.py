@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 _PATIENCE_S: Final = 5.0  # at the end, until viewers have received all data
 _DISK_PATIENCE_S: Final = 60.0  # with a disk that takes nothing
 _QUEUED: Final = 100  # steps that viewers are behind at most, besides those that Rerun keeps
-_BEGINNING: Final = 4096  # bytes that must fit on the disk to begin with
 
 
 class RecordingFile:
@@ -51,7 +50,7 @@ class RecordingFile:
         """Whether it was moved or removed meanwhile."""
         try:
             create_regular(path)
-            path.write_bytes(bytes(_BEGINNING))
+            path.write_bytes(bytes(4096))  # which must fit to begin with
             self._file = path.open("r+b", buffering=0)
             self._file.truncate(0)
         except OSError as error:
@@ -178,8 +177,6 @@ def let_go() -> None:
 _log = logging.getLogger(__name__)
 
 _ROOM: Final = 9 * 2**29  # bytes of addresses that a run with a recording takes, most of them Rerun's and never used
-_BATCH_S: Final = 1.0  # of steps that are written to the file in one piece; until then, a step takes 0.15 MB of memory
-_GRAPH_DRAWN: Final = 50  # times at most while the number of views doubles: drawing it takes time for each of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +291,7 @@ class RerunStream:
 def graph_due(step: Step) -> bool:
     """Return whether the whole graph is to be drawn again: with every view, later with every second and so on."""
     count = len(step.views)
-    return step.last or count % max(1, count // _GRAPH_DRAWN) == 0
+    return step.last or count % max(1, count // 50) == 0
 
 
 def load() -> None:
@@ -351,7 +348,7 @@ def open_stream(
         sinks.append(rr.GrpcSink(connect))
     elif connect is not None:
         _log.warning("`connect` %s: no viewer listens there; the run goes on without it", connect)
-    pieces = rr.ChunkBatcherConfig(flush_tick=_BATCH_S)
+    pieces = rr.ChunkBatcherConfig(flush_tick=1.0)  # until then, a step takes 0.15 MB of memory
     same = uuid.uuid4()  # for viewers, in which the file is opened later
     recording = rr.RecordingStream(
         entities.APPLICATION, recording_id=same, default_enabled=file is not None, batcher_config=pieces

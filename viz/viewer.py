@@ -243,12 +243,10 @@ def _file_server(file: Path, origin: str) -> ThreadingHTTPServer:
 
 
 def _sink(port: int) -> str:
-    """Return the address a recording is sent to."""
     return f"rerun+http://{_HOST}:{port}/proxy"
 
 
 def _free_port() -> int:
-    """Return a free port."""
     with socket.socket() as probe:
         probe.bind((_HOST, 0))
         return int(probe.getsockname()[1])

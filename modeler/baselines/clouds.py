@@ -30,9 +30,6 @@ from modeler.types import (
     ViewPair,
 )
 
-_START_SAMPLES = 1000  # of the prior, from which the mean start is taken
-_SPACING_POINTS = 400  # whose median distance to their neighbours is taken
-_OPEN_ROTATION_RAD = np.pi / 2  # root mean square beyond which a mean rotation is meaningless
 _MIN_SIGMA = 1e-6  # rad or m: keeps covariances positive definite if prior or residuals vanish
 
 
@@ -76,7 +73,7 @@ class Cloud:
     @property
     def spacing_m(self) -> float:
         """Median distance of a point to its nearest neighbour, estimated from a few hundred points."""
-        some = self.points_m[:: 1 + len(self.points_m) // _SPACING_POINTS]
+        some = self.points_m[:: 1 + len(self.points_m) // 400]
         distances, _ = KDTree(self.points_m).query(some, k=2)
         return float(np.median(distances[:, 1]))
 
@@ -126,14 +123,14 @@ def start(source: RayImage, target: RayImage, density: AbstractPoseDensity, rng:
     root mean square over 90°), it has no centre, and this shift itself is the initial pose. For a prior given by
     centroids and a largest rotation, the two agree within sampling error.
     """
-    samples = density.sample(_START_SAMPLES, rng)
+    samples = density.sample(1000, rng)
     if len(source.points_m) and len(target.points_m):
         centre_m = source.centroid_m
         guess = se3.translation(target.centroid_m - centre_m)
     else:
         centre_m, guess = np.zeros(3), samples[0]
     pose, _ = se3.mean(samples, np.ones(len(samples)), start=guess)
-    if _rms_angle(pose, samples) > _OPEN_ROTATION_RAD:
+    if _rms_angle(pose, samples) > 0.5 * np.pi:  # beyond which a mean rotation is meaningless
         pose = guess
     shifts = samples[:, :3, :3] @ centre_m + samples[:, :3, 3] - se3.transform(pose, centre_m[None])
     return Start(

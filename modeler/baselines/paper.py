@@ -33,9 +33,7 @@ from modeler.types import (
 
 _SAMPLES, _UNIFORM_SAMPLES = 200_000, 2_000_000  # from a prior, and from everywhere
 _BATCH = 50_000  # samples drawn at a time
-_PILOT = 4096  # poses by which the checks are ordered
 _ANGLE_LIMIT_RAD = 2.0  # up to which rejection sampling of the rotation mostly succeeds
-_WIDENING = 1.5  # largest spread of a point's rays for the test, relative to that of the nearest point seen
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ class PaperRegistrar(AbstractRegistrar):
         free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below, device=device)
         batches = self._drawn(density if draws is None else draws, samples, rng)
         first = next(batches)
-        free = free.ordered(first[:_PILOT])
+        free = free.ordered(first[:4096])
         if device is None:
             for poses in chain([first], batches):
                 passing = poses[free.passes(poses)]
@@ -271,7 +269,7 @@ def _side(
     noise = other.noise
     inverses = np.stack([kernel.ray_jacobian_inverse(point) for point in own.points_m])
     spread_m2 = np.linalg.eigvalsh(inverses @ noise @ inverses.transpose(0, 2, 1))[:, -1]
-    widening = _WIDENING * max(
+    widening = 1.5 * max(  # the largest spread of a point's rays, of the nearest's
         np.max(np.sum(view.points_m**2, axis=1) / view.points_m[:, 2] ** 4) for view in (own, other)
     )
     lateral = np.linalg.eigvalsh(noise[:2, :2])[-1]
@@ -292,7 +290,6 @@ def _side(
 
 
 def _nearest_ranges(ranges_m: Array, reach_px: Array, device: str | None) -> np.ndarray:
-    """Return `kernels.paper.nearest_ranges`."""
     if device is None:
         return kernel.nearest_ranges(ranges_m, reach_px)
     from modeler.kernels.gpu.paper import nearest_ranges

@@ -179,9 +179,7 @@ def _own(name: str, module: str, attribute: str, workers: int | None) -> Executo
     return executor
 
 
-_LOSSES = 3  # how often an engine may lose a job
 _RETURNS_S = 120.0  # time to wait for a lost engine
-_LAGS_S = 60.0  # that a shared disk may show what other machines wrote: NFS keeps folders for so long (acdirmax)
 
 
 def results(
@@ -236,7 +234,7 @@ def _until_lost(executor: Executor, waiting: dict[str, Job], losses: Counter[str
             one = future.result()
         except Exception as error:  # whatever an engine raises
             losses[job.name] += 1
-            if losses[job.name] <= _LOSSES:
+            if losses[job.name] <= 3:
                 if isinstance(error, CancelledError):
                     return
                 submit(job)
@@ -254,6 +252,6 @@ def _until_lost(executor: Executor, waiting: dict[str, Job], losses: Counter[str
 
 def _await_note(job: Job, one: Ended) -> None:
     """Wait until the state that a job wrote, perhaps elsewhere, is seen here, from where models are listed."""
-    given_up_s = time.monotonic() + _LAGS_S
+    given_up_s = time.monotonic() + 60.0  # a shared disk may lag: NFS keeps folders for so long (acdirmax)
     while read_note(job.note).get("status") != one.status and time.monotonic() < given_up_s:
         time.sleep(0.2)

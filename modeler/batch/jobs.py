@@ -29,7 +29,6 @@ NOTES = ".batch"  # subfolder of a batch with the state of each sequence and the
 TRIES = 2  # how often a sequence that fails is tried
 ENDED = (0, 3)  # statuses of completed builds
 Standing = Literal["new", "interrupted", "done", "changed", "other", "failed"]
-_NOTE_BYTES = 1 << 24  # of a note at most
 _MOST = 1 << 31  # of a number in it
 _LINE = "modeler: "
 
@@ -127,7 +126,7 @@ def read_note(path: Path) -> dict[str, Any]:
     from modeler.types import InputError
 
     try:
-        note = read_json(path, _NOTE_BYTES)
+        note = read_json(path, 1 << 24)
     except InputError:
         return {}
     return note if isinstance(note, dict) and all(_valid(name, value) for name, value in note.items()) else {}

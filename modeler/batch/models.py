@@ -63,11 +63,13 @@ def _errors(run: Path, report: dict[str, Any], centre_m: Array) -> dict[str, flo
 
 
 def thumbnail_of(run: Path, out: Path) -> None:
-    """Write a small picture of the model of a run, if it has one."""
-    from modeler.export import model_upright
+    """Write a small picture of the model of a run, if it has one that is newer than the picture."""
     from modeler.viz.report.mesh import portrait, read_mesh
 
-    mesh = read_mesh(run / "model.ply")
+    model = run / "model.ply"
+    if out.exists() and not (model.exists() and out.stat().st_mtime_ns < model.stat().st_mtime_ns):
+        return
+    mesh = read_mesh(model)
     if mesh is not None:
         upright = model_upright(RunFolder(run).report())
         write_atomically(out, portrait(mesh, upright, (THUMBNAIL_PX, THUMBNAIL_PX)))

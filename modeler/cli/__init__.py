@@ -34,9 +34,7 @@ from modeler.system.processes import check_room, share_one_heap
 complain = partial(say, level=logging.ERROR)
 _ROOM = 7 * 2**27  # bytes of addresses that registering two frames takes, a third of them used
 _FILES = 256  # open at the same time: Rerun ends the process where it cannot open its own
-_THREAD_DIGITS = 3  # no machine has 1,000 cores to use
 _CHOICES = re.compile(r"Expected one of \(([^)]*)\)")
-_HELP_INDENT = " " * 8  # of an option's description in the parser's error box
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -146,7 +144,7 @@ def _one_line(box: str) -> str:
     for row in rows:
         if row and not row.strip("─+- "):
             sections.append([])
-        elif not row.startswith(_HELP_INDENT):
+        elif not row.startswith(" " * 8):  # an option's description
             sections[-1].append(row)
     lines = [[" ".join(row.split()) for row in takewhile(bool, section)] for section in sections]
     what, *others = filter(None, lines)  # where there is no border, a line below the title is a section, too
@@ -206,7 +204,8 @@ def _instead_of(name: str, module: Any) -> Iterator[None]:
 def _check_environment() -> None:
     """Reject settings under which nothing can be computed, and drop those for developers of the libraries."""
     threads, interpreted = (os.environ.get(f"NUMBA_{name}", "") for name in ("NUM_THREADS", "DISABLE_JIT"))
-    if threads and not (threads.isdecimal() and len(threads) <= _THREAD_DIGITS and int(threads) > 0):
+    # No machine has 1,000 cores to use.
+    if threads and not (threads.isdecimal() and len(threads) <= 3 and int(threads) > 0):
         complain(f"NUMBA_NUM_THREADS={threads[:99]} is not a number of threads; set it to 1 or more, or unset it")
         raise SystemExit(2)
     if interpreted not in ("", "0"):

@@ -59,7 +59,6 @@ class CalibrateSensor:
 
 
 def _facts(name: str, found: Calibration, sensor: dict[str, float]) -> dict[str, object]:
-    """Return the other contents of the file."""
     return {
         "schema": 1,
         "sequence": name,

@@ -27,12 +27,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
-_AGAIN_S = 0.05  # until a signal is sent again that arrived where nothing can be raised
 _PAIRS_TIMED = 3  # until it is said how long all takes
 _WHOLE = 2.6  # a build takes so many times its pass over the frames: 2.4 for the bundled box, 2.75 for the capture cap
-_WORTH_SAYING_S = 20.0  # what takes less is over soon after the first pairs
 _PULSE_S = 30.0  # between signs of life where there is no bar
-_ONE_BY_ONE = 3  # consecutive frames left out that are reported one by one
 
 
 def say(words: str, level: int = logging.INFO, show: Callable[[str], object] | None = None) -> None:
@@ -122,7 +119,7 @@ def endable() -> Iterator[None]:
 
     def dropped(error: sys.UnraisableHookArgs) -> None:
         if got and error.exc_type in (KeyboardInterrupt, SystemExit):  # send it again, to somewhere else
-            threading.Timer(_AGAIN_S, os.kill, (os.getpid(), got[-1])).start()
+            threading.Timer(0.05, os.kill, (os.getpid(), got[-1])).start()
         else:
             otherwise(error)
 
@@ -324,7 +321,7 @@ class Console:
             self._began_s = now_s
         elif self._frames is not None and done == _PAIRS_TIMED + 1 < self._frames:
             whole_s = _WHOLE * (now_s - self._began_s) / _PAIRS_TIMED * self._frames
-            if whole_s > _WORTH_SAYING_S:
+            if whole_s > 20.0:  # what takes less is over soon
                 self._say(f"{self._frames} frames: to register, close loops and fuse takes about {_rounded(whole_s)}")
         elif not self.watched and now_s - self._said_s > _PULSE_S:
             self._say(f"frame {done}" if self._frames is None else f"frame {done} of {self._frames}")
@@ -347,7 +344,7 @@ class Console:
             self._release()
             self._reported = what
         self._aloud += 1
-        if self._aloud > _ONE_BY_ONE:
+        if self._aloud > 3:
             self._held.append(frame)
         else:
             self._say(f"frame {frame} is {what}")

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from modeler.types import AbstractRegistrar, Array
 
 
-_SAME_M = 1e-5  # to which files of one surface agree
-
-
 @dataclass(frozen=True)
 class Evaluate:
     """Register pairs of frames with known true motion by several methods, and report their errors.
@@ -277,7 +274,7 @@ def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
         meshes.append(true_mesh(part.sequence))
     first = meshes[0].vertices_m
     for part, mesh in zip(parts, meshes, strict=True):
-        if mesh.vertices_m.shape != first.shape or abs(mesh.vertices_m - first).max() > _SAME_M:
+        if mesh.vertices_m.shape != first.shape or abs(mesh.vertices_m - first).max() > 1e-5:  # m
             raise InputError(
                 f"{run}: {parts[0].sequence.name} and {part.sequence.name}, of which it is joined, have different true "
                 "surfaces; evaluate the runs it joins"

@@ -130,11 +130,8 @@ class Gallery:
             for row in progress.track(rows):
                 name = row["name"]
                 if row.get("triangles"):
-                    picture, model = self.folder / NOTES / f"{name}.jpg", self.folder / name / "model.ply"
-                    if not picture.exists() or (
-                        model.exists() and picture.stat().st_mtime_ns < model.stat().st_mtime_ns
-                    ):
-                        thumbnail_of(self.folder / name, picture)
+                    picture = self.folder / NOTES / f"{name}.jpg"
+                    thumbnail_of(self.folder / name, picture)
                     if picture.exists():  # not so where the model was removed
                         pictures[name] = read_regular(picture)
                 pages = [self.folder / name / page for page in ("report.html", "report.json")]

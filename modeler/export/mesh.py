@@ -26,10 +26,8 @@ AS_GIVEN: Final = np.diag([1.0, -1.0, -1.0])
 
 Tint = Literal["views", "sigma"]
 MADE_UP_RGB: Final = (230, 90, 200)  # of unobserved, interpolated surface, wherever it is shown
-MOST_VIEWS: Final = 12  # views at the end of the scale
 MOST_SIGMA_M: Final = 2e-3  # standard deviation at the end of the scale
 
-_TRIES = (1.0, 0.98, 0.95, 0.9, 0.8)  # of what is asked for, until no edge of three triangles is left
 _SHARE = 0.5  # of vertices' sd by which triangles may be off: as an error of its own, it would add an eighth to the sd
 _MERGED = 8  # triangles around an edge, fewest that a collapse merges; the library counts each once for every corner
 _RIM = 100.0  # weight of rims: with 1, the bundled box's moves by 0.6 mm (99 %), with 100 by 0.25, with 1,000 by 0.12
@@ -205,7 +203,6 @@ def _3mf(model: ObjectModel, unit: Literal["m", "mm"]) -> bytes:
 
 
 def _stl(model: ObjectModel, unit: str) -> bytes:
-    """Return a binary STL file."""
     corners = model.vertices_m[model.triangles]
     normals = area_vectors_m2(model.vertices_m, model.triangles)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -241,7 +238,7 @@ def simplified(model: ObjectModel, triangles: int | None = None) -> ObjectModel:
     )
     closed = not len(mesh.get_non_manifold_edges(allow_boundary_edges=False))
     fewer = mesh
-    for share in _TRIES:
+    for share in (1.0, 0.98, 0.95, 0.9, 0.8):  # until no edge of three triangles is left
         if triangles is None:
             fewer = mesh.simplify_quadric_decimation(4, share * error, _RIM)
         else:
@@ -290,7 +287,7 @@ def tinted(model: ObjectModel, tint: Tint) -> ObjectModel:
     views, sigmas_m = model.vertex_views, model.vertex_sigmas_m
     if views is None or sigmas_m is None:
         raise InputError("the model has no view counts of its vertices; build it again with this version")
-    rgb = sigma_rgb(sigmas_m) if tint == "sigma" else _scale_rgb(views / MOST_VIEWS)
+    rgb = sigma_rgb(sigmas_m) if tint == "sigma" else _scale_rgb(views / 12)  # 12 at the end of the scale
     rgb[views == 0] = MADE_UP_RGB
     return replace(model, vertex_colours=np.rint(rgb).astype(np.uint8))
 

@@ -29,7 +29,6 @@ from modeler.types import (
     ViewPair,
 )
 
-_DRAWN = 64  # poses at which priors are compared
 _CHECK_BYTES = 16
 _GAUSSIAN = ("mean", "covariance", "by_focal")  # its arrays
 _digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several keys
@@ -171,14 +170,13 @@ def _of_prior(density: AbstractPoseDensity) -> str:
     A pair may be registered more than once: with wider limits, or with what was learned from frames in between.
     """
     digest = hashlib.blake2b(str(density.evidence).encode(), digest_size=12)
-    drawn = density.sample(_DRAWN, np.random.default_rng(0))
+    drawn = density.sample(64, np.random.default_rng(0))
     for numbers in (drawn, density.log_density(drawn), density.log_prior(drawn)):
         digest.update(np.ascontiguousarray(numbers).tobytes())
     return digest.hexdigest()
 
 
 def _digest(view: RayImage) -> bytes:
-    """Return a digest of a view."""
     frame, digest = view.frame, hashlib.blake2b()
     digest.update(
         f"{frame.camera!r} {view.plane!r} {view.sigma_wh!r} {view.sigma_r_m!r} {view.sigma_colour_px!r}".encode()

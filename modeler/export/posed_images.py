@@ -23,10 +23,8 @@ from modeler.export.files import ply_bytes, write_atomically
 from modeler.system.pictures import encoded
 from modeler.types import Array, BoolArray, Camera, Frame, ObjectModel
 
-MOST_POINTS: Final = 20_000  # initial points; trainers add more where they need them
 _PIXEL_CENTRE: Final = 0.5  # nerfstudio and COLMAP measure from the corner of the first pixel
 _OPENGL_AXES: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, z backward
-_PINHOLE: Final = 1  # COLMAP's number of the model without distortion
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +56,8 @@ class PosedImages:
             for frame, silhouette in silhouettes(model, frames.values(), camera_from_world)
         }
         count = len(model.vertices_m)
-        some = np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int64))
+        # Trainers add more where they need them.
+        some = np.unique(np.linspace(0, count - 1, min(count, 20_000)).astype(np.int64))
         return cls(
             frames, world_from_camera, model.vertices_m[some], model.vertex_normals[some], model.vertex_colours[some]
         )
@@ -161,7 +160,8 @@ def write_colmap(data: PosedImages, folder: Path, tolerance_m: float) -> int:
     for camera, number in numbers.items():
         values = camera.fx, camera.fy, camera.cx + _PIXEL_CENTRE, camera.cy + _PIXEL_CENTRE
         text[0] += f"{number} PINHOLE {camera.width} {camera.height} {_words(*values)}\n"
-        binary[0] += struct.pack("<iiQQ4d", number, _PINHOLE, camera.width, camera.height, *values)
+        # 1: COLMAP's model without distortion.
+        binary[0] += struct.pack("<iiQQ4d", number, 1, camera.width, camera.height, *values)
     text[1] += "".join(words for words, _ in images)
     binary[1] += b"".join(packed for _, packed in images)
     lines, records = [], []

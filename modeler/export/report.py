@@ -30,13 +30,10 @@ from modeler.types import (
 from modeler.verdict import judged
 from modeler.verdict.spreads import total_depth_scale_sigma
 
-_SCHEMA = 2  # of report.json (docs/files.md)
 _PACKAGES = ("modeler", "gtsam", "numba", "numpy", "open3d", "scipy")
 _FREE_RAD = np.radians(8.0)  # twice this is the usual step between views: whether there was one, the edge does not say
-_FREE_M = 0.01  # surfaces of a hand-sized object are then visibly apart
 _OF_FRAME = tuple(entry.name for entry in fields(FrameRecord))  # `asdict` would take as long as all else
 _ALIKE = np.cos(np.radians(25.0))  # nearer than this, a direction goes by the name of another
-_LONG = 1.5  # ratio of length to width above which an object has its own axis
 
 
 def _versions() -> dict[str, str]:
@@ -83,7 +80,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
     first = views.get(min(solution.trajectory, default=-1))  # whose camera frame is the object's
     support = None if first is None else first.plane
     report = {
-        "schema": _SCHEMA,
+        "schema": 2,  # docs/files.md
         "sequence": meta.sequence,
         "seed": meta.seed,
         "prior": meta.prior,
@@ -261,7 +258,7 @@ def _free(pose: PoseGaussian, view: RayImage | None) -> Iterator[str]:
     of_centre = se3.covariance_about(pose.covariance, view.centroid_m)[3:, 3:]  # how the object's middle moves
     sigmas_m, axes = _principal(of_centre)
     for sigma_m, axis in zip(sigmas_m, axes, strict=True):
-        if sigma_m > _FREE_M:
+        if sigma_m > 0.01:  # surfaces of a hand-sized object are then visibly apart
             yield f"free to shift along {_name(axis, view)}: {1000.0 * sigma_m:.0f} mm sd"
 
 
@@ -304,7 +301,7 @@ def _directions(view: RayImage | None) -> Iterator[tuple[str, Array]]:
     """Yield named unit directions (3,), those that say most first."""
     if view is not None and len(view.points_m) > 3:
         lengths, axes = _principal(np.cov(view.points_m.T))
-        if lengths[0] > _LONG * lengths[1]:
+        if lengths[0] > 1.5 * lengths[1]:  # then it has an axis of its own
             yield "its own axis", axes[0]
     if view is not None and view.plane is not None:
         yield "the table's normal", view.plane.normal

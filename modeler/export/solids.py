@@ -23,7 +23,6 @@ HULL_TRIANGLES = 500  # most triangles of a convex part; a ball then loses 3 % o
 # own settings and 8000 triangles, 70 parts in five minutes.
 PART_TRIANGLES = 1_500  # triangles of the mesh from which convex parts are found
 _SEARCH: Mapping[str, Any] = {"threshold": 0.08, "resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
-_LEAST_AREA_M2 = 1e-12  # of a triangle: (1 µm)², below the resolution of a 32-bit file at a distance of 10 m
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +112,7 @@ def _hull(points_m: Array) -> tuple[Array, npt.NDArray[np.int64]]:
 
 def without_degenerate(model: ObjectModel) -> ObjectModel:
     """Return the model without triangles that have no area."""
-    kept = areas_m2(model.vertices_m, model.triangles) > _LEAST_AREA_M2
+    kept = areas_m2(model.vertices_m, model.triangles) > 1e-12  # (1 µm)², below the resolution of a 32-bit file at 10 m
     return model if kept.all() else replace(model, triangles=model.triangles[kept])
 
 

@@ -17,8 +17,6 @@ from modeler.export.mesh import Texture, linear_rgb
 from modeler.export.solids import FRICTION, Body, ConvexParts, PhysicsFiles
 from modeler.types import Array, ObjectModel
 
-_GREY = 0.45  # linear, of objects without colour
-
 
 def write_usd(files: PhysicsFiles, model: ObjectModel, texture: Texture | None, body: Body, parts: ConvexParts) -> None:
     """Write the object as one rigid body, in m and kg, z up; its texture is `files.texture` beside it.
@@ -64,7 +62,7 @@ def write_usd(files: PhysicsFiles, model: ObjectModel, texture: Texture | None, 
         shown = visual.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
         shown.Set(linear_rgb(model.vertex_colours).astype(np.float32))
     else:
-        visual.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(_GREY)])
+        visual.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(0.45)])  # linear
 
     rough = UsdShade.Material.Define(stage, root.AppendPath("Looks/friction"))
     contact = UsdPhysics.MaterialAPI.Apply(rough.GetPrim())

@@ -84,7 +84,6 @@ class GeneralDensity(AbstractPoseDensity):
     """Largest distance between the target's centroid and the source's, transformed."""
     middle: Array = field(default_factory=lambda: np.eye(3))
     """(3, 3) central rotation."""
-    evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         angle = sample_angles(self.max_rotation_rad, count, rng)

@@ -57,7 +57,6 @@ class Gaussian(AbstractPoseDensity):
     """(6, 6) of the rotation vector in rad, then of the point's position in m, in target coordinates."""
     centre_m: Array
     """(3,) the point, in source coordinates."""
-    evidence: bool = True
 
     def __post_init__(self) -> None:
         """Check the covariance."""
@@ -208,7 +207,6 @@ class Alternatives(AbstractPoseDensity):
     """The alternatives, each evidence."""
     probabilities: Array
     """(k,) of each, positive, summing to 1."""
-    evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         chosen = rng.choice(len(self.densities), count, p=self.probabilities)

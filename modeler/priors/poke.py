@@ -142,7 +142,6 @@ class PokeDensity(AbstractPoseDensity):
     """(3, 3)."""
     backwards: bool
     """Whether the source is the later view."""
-    evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         drawn = self.mean + rng.normal(size=(count, 3)) @ np.linalg.cholesky(self.covariance).T

@@ -201,7 +201,6 @@ class TableDensity(AbstractPoseDensity):
     """Largest distance, in the plane, between the target's centroid and the source's, transformed."""
     middle_rad: float = 0.0
     """Central turn."""
-    evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         turn_rad = self.middle_rad + rng.uniform(-self.max_rotation_rad, self.max_rotation_rad, count)

@@ -176,7 +176,6 @@ class AboutAxis(AbstractPoseDensity):
     """Radius of the disc."""
     wobble_m: float
     """Standard deviation of the shift that is not due to the turn about the axis."""
-    evidence: bool = True
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         poses = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()

@@ -37,7 +37,6 @@ from modeler.types import (
     explain,
 )
 
-_PARTNERS: Final = 3  # views of the model that a new one is registered with: two that agree, and one that may fail
 _WHY: Final = Stated("it agrees with the place of the frame on the model")
 
 
@@ -165,7 +164,8 @@ def _nearest(before: Reopened, object_from_camera: Array, view: RayImage) -> lis
     frames = sorted(frame for frame in before.views if frame in poses)
     rays = np.stack([object_from_camera[:3, 3], *(poses[frame][:3, 3] for frame in frames)]) - centre_m
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return [frames[k] for k in np.argsort(-(rays[1:] @ rays[0]), kind="stable")[:_PARTNERS]]
+    # Two that agree, and one that may fail.
+    return [frames[k] for k in np.argsort(-(rays[1:] @ rays[0]), kind="stable")[:3]]
 
 
 def _camera(before: Reopened, frames: AbstractSequence) -> Mapping[str, Any] | None:

@@ -98,8 +98,6 @@ def mesh_checks(path: Path, *, unit_m: float = 1.0, most_triangles: int) -> Chec
 
 
 _MESHES: Final = {"foundationpose": "model.obj", "print": "model.stl"}
-_PLAIN_TRIANGLES: Final = 50_000  # of a mesh without texture, at most
-_DENSITY_KG_M3: Final = 1000.0  # of water; plastics have 900 to 1400, wood 400 to 800, most boxes are hollow
 
 Purpose = Literal["foundationpose", "bop", "mujoco", "urdf", "isaac", "gazebo", "print", "nerfstudio", "colmap"]
 """Programs for which there are presets."""
@@ -198,8 +196,8 @@ class Preset:
     def _coloured(self, model: ObjectModel) -> tuple[ObjectModel, Texture | None]:
         """Return the mesh, simplified and without degenerate triangles, with its texture where frames have colour."""
         coloured = self._volume.views.coloured
-        if self.triangles is None:
-            model = files.simplified(files.simplified(model), TRIANGLES if coloured else _PLAIN_TRIANGLES)
+        if self.triangles is None:  # without texture 50,000 at most
+            model = files.simplified(files.simplified(model), TRIANGLES if coloured else 50_000)
         else:
             model = files.simplified(model, self.triangles)
         model = solids.without_degenerate(model)
@@ -300,7 +298,7 @@ class Preset:
     def _solid(self) -> _Solid:
         whole = self._model(watertight=True)
         place = files.placement(whole, self._reopened.report, "base", "z")
-        density = self.density_kg_m3 or _DENSITY_KG_M3
+        density = self.density_kg_m3 or 1000.0  # water's; plastics have 900 to 1400, wood 400 to 800
         body = solids.body_of(place.placed(whole), density_kg_m3=density, mass_kg=self.mass_kg)
         self.say("finding convex parts, which takes some 10 s with CoACD")
         parts = solids.convex_parts(place.placed(whole))

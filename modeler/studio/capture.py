@@ -213,17 +213,14 @@ class Recorder:
         self.taken += 1
 
 
-_MIDDLE: Final = 0.25  # of the image on each side is not its middle
-_HOLES: Final = 1e-3  # of all pixels: ten recordings of whole scenes lack 0.01 to 0.3 of them
 _STEP: Final = 0.1  # of the distance: less is one surface, seen at a slant
-_GHOST_POINTS: Final = 3000  # of each view: of an object of 300 x 300 px, one in 30 pixels
 _GHOST_PX: Final = 3  # closes gaps of 6 px between them, and clears specks as wide
 _TURN: Final = re.compile(r"turn by (\d+)°")
 
 
 def nothing_near(depth_m: npt.NDArray[np.float32]) -> bool:
     """Return whether most of the middle of a depth image (h, w) is not measured, as where something is too close."""
-    rows, columns = (slice(round(_MIDDLE * side), round((1.0 - _MIDDLE) * side)) for side in depth_m.shape)
+    rows, columns = (slice(round(0.25 * side), round(0.75 * side)) for side in depth_m.shape)
     return bool(np.mean(depth_m[rows, columns] > 0.0) < 0.5)
 
 
@@ -234,7 +231,7 @@ def is_filled(depth_m: npt.NDArray[np.float32]) -> bool:
     some pixels there have no depth. Time-of-flight cameras lose those pixels too, as they mix two surfaces.
     """
     known = depth_m > 0.0
-    if np.mean(~known) > _HOLES:
+    if np.mean(~known) > 1e-3:  # ten recordings of whole scenes lack 0.01 to 0.3 of all pixels
         return False
     left, right = depth_m[:, :-1], depth_m[:, 1:]
     with np.errstate(invalid="ignore"):
@@ -288,7 +285,7 @@ def ghost(frames: Mapping[int, tuple[Frame, BoolArray]], report: Mapping[str, An
 def _in_object(frame: Frame, mask: BoolArray, object_from_camera: Array) -> Array:
     """Return some points (n, 3) of the object in its own coordinates."""
     rows, columns = np.nonzero(mask & (frame.depth_m > 0.0))
-    some = slice(None, None, max(len(rows) // _GHOST_POINTS, 1))
+    some = slice(None, None, max(len(rows) // 3000, 1))  # of an object of 300 x 300 px, one in 30 pixels
     w, h = frame.camera.rays()
     places = rows[some], columns[some]
     depth_m = frame.depth_m[places].astype(np.float64)

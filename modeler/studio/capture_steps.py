@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from modeler.studio.page import Page
 
 
-_LATE_S: Final = 15.0  # without a frame: longer than a person takes to turn an object by hand
 _FOLDER: Final = ""
 _CAMERAS: Final = {
     "realsense:": "Intel RealSense",
@@ -120,7 +119,6 @@ class CaptureStep:
             self.page.studio.recorder.take()
 
     async def _start(self, begin: Callable[[], list[Job]]) -> None:
-        """Begin a capture."""
         if self.page.busy():
             return
         try:
@@ -173,7 +171,7 @@ def _come(capture: Capture, placed: bool | None, words: str) -> str:
             f"{capture.count} frames; the model begins with the first few." if capture.count else "Waiting for frames."
         )
     if placed:
-        late = f" No new one for {capture.waits_s:.0f} s." if capture.waits_s > _LATE_S else ""
+        late = f" No new one for {capture.waits_s:.0f} s." if capture.waits_s > 15.0 else ""  # longer than a turn takes
         return f"{sentence(words)} Turn it: the next view may come.{late}"
     return f"{sentence(words)} Turn it back a little, and try again."
 

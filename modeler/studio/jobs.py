@@ -26,7 +26,6 @@ _COUNT: Final = re.compile(r"registering more pairs: (\d+) of (\d+)")
 _STARTED: Final = re.compile(r"frame \d+")
 # Shares of a build's time: its pass over the frames takes 1 / 2.6 (`modeler.cli.console`), fusing and writing a tenth.
 _FRAMES_END, _PAIRS_END = 0.4, 0.9
-_STARTING_S: Final = 0.05  # in which a process that was begun has the words of its command
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class Job:
         with contextlib.suppress(OSError):  # one that was started by a server before this one
             words = Path(f"/proc/{self.pid}/cmdline").read_bytes()
             if not words:  # it has ended, or is being started at this moment
-                time.sleep(_STARTING_S)
+                time.sleep(0.05)
                 words = Path(f"/proc/{self.pid}/cmdline").read_bytes()
             return os.fsencode(self.log) in words
         return False

@@ -29,10 +29,7 @@ from modeler.types import InputError
 if TYPE_CHECKING:
     from modeler.studio.page import Page
 
-_DRAW_S: Final = 0.05  # between redrawings of a stroke, so that the connection keeps up
-_CLICK_PX: Final = 4.0  # a pointer that moves less has been clicked
 _BRUSH_PX: Final = (2, 8, 40)  # least, usual and greatest radius
-_THUMBNAILS: Final = 300  # frames shown small; of longer captures every so many-th
 _NAMED: Final = 12  # doubtful frames
 
 
@@ -89,7 +86,7 @@ class ObjectStep:
     def _draw_strip(self, scan: Scan) -> None:
         """Draw the small frames, each a button."""
         self.small: dict[int, tuple[ui.element, ui.element]] = {}
-        stride = math.ceil(len(scan.sequence.indices) / _THUMBNAILS)
+        stride = math.ceil(len(scan.sequence.indices) / 300)  # of longer captures every so many-th
         with self.strip:
             for k in scan.sequence.indices[::stride]:
                 with ui.element("button").props(f"aria-label='frame {k}'") as button:
@@ -139,14 +136,14 @@ class ObjectStep:
                 points.append(at)
             if self.tool != "Box":
                 await self._act(lambda: scan.paint(self.frame, points, self.brush_px, add=self.tool == "Add"))
-            elif math.dist(points[0], points[-1]) > _CLICK_PX:
+            elif math.dist(points[0], points[-1]) > 4.0:  # else it was a click
                 await self._act(scan.box, points[0], points[-1])
             else:
                 await self._act(scan.point_at, self.frame, *points[0])
 
     def _preview(self, scan: Scan) -> None:
         """Draw the box or the stroke so far."""
-        if time.monotonic() - self._drawn_s < _DRAW_S:
+        if time.monotonic() - self._drawn_s < 0.05:  # so that the connection keeps up
             return
         self._drawn_s = time.monotonic()
         if self.tool == "Box":

@@ -30,7 +30,6 @@ from modeler.system.regular_files import read_regular
 from modeler.types import BoolArray, Camera, InputError, Outcome, Segmentation
 
 STATE: Final = "scan.json"  # file of a scan's choices, by which its folder is known
-_BOXES: Final = (0.25, 0.4, 0.6, 0.85)  # sides of the boxes tried around a click, as shares of the image's
 _RUN: Final = re.compile(r"run-(\d+)")
 MESHES: Final = tuple(suffix.removeprefix(".") for suffix in FORMATS)  # kinds of mesh files
 
@@ -168,7 +167,8 @@ class Scan:
         if mask is not None and mask[row, column]:
             return
         frames = [self.sequence.frame(k) for k in scene_frames(self.sequence.indices)]
-        for roi in (None, *(_around(column, row, share, camera) for share in _BOXES)):
+        # Sides, as shares of the image's.
+        for roi in (None, *(_around(column, row, share, camera) for share in (0.25, 0.4, 0.6, 0.85))):
             segmenter = Segmenter(roi=roi)
             inside = segmenter.segment(image, segmenter.scene(frames)).mask
             if inside[row, column] and not (roi is not None and _at_edge(inside, roi)):

@@ -55,7 +55,6 @@ _HEADERS: Final = (
     (b"referrer-policy", b"no-referrer"),
     (b"x-content-type-options", b"nosniff"),
 )
-_CONFLICT: Final = 4403  # code of a refused web socket
 _SAFE: Final = ("GET", "HEAD")
 
 
@@ -132,7 +131,7 @@ def _values(headers: list[tuple[bytes, str]], name: bytes) -> list[str]:
 async def _refuse(scope: Scope, send: Send, status: HTTPStatus) -> None:
     """Answer with a status alone."""
     if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": _CONFLICT})
+        await send({"type": "websocket.close", "code": 4403})
         return
     words = f"{status.value} {status.phrase}: open the address that modeler studio has printed\n".encode()
     headers = [(b"content-type", b"text/plain"), (b"content-length", str(len(words)).encode()), *_HEADERS]
@@ -168,7 +167,6 @@ def _with_headers(send: Send) -> Send:
 
 
 HOST: Final = "127.0.0.1"
-_CLOSE_S: Final = 2  # for open connections when the server ends
 _OF_RUN: Final = ("report.html", "recording.rrd")
 _VIEWER_FILE: Final = re.compile(r"[\w.-]{0,64}")
 _ELSEWHERE: Final = re.compile(rb"<link[^>]*https://[^>]*>")
@@ -245,7 +243,7 @@ def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
         access_log=False,
         lifespan="on",
         ws_max_size=MOST_BYTES,
-        timeout_graceful_shutdown=_CLOSE_S,
+        timeout_graceful_shutdown=2,  # for open connections
         server_header=False,
     )
     try:
@@ -314,10 +312,9 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
         folder = _run(studio, name, run)
         if folder is None:
             return Response(status_code=404)
-        drawn, model = folder.with_name(f"{run}.jpg"), folder / "model.ply"
+        drawn = folder.with_name(f"{run}.jpg")
         with contextlib.suppress(InputError, OSError):
-            if not drawn.exists() or drawn.stat().st_mtime_ns < model.stat().st_mtime_ns:
-                thumbnail_of(folder, drawn)
+            thumbnail_of(folder, drawn)
             return _picture(read_regular(drawn))
         return Response(status_code=404)
 
@@ -365,7 +362,6 @@ def _run(studio: Studio, name: str, run: str) -> Path | None:
 
 
 def _file(path: Path, download: str | None = None) -> Response:
-    """Send a regular file."""
     try:
         check_regular(path)
     except InputError:

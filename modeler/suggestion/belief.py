@@ -37,7 +37,6 @@ from modeler.types import (
 
 _POINTS: Final = 1500  # of a view, used to evaluate its surface
 _JOINED: Final = 0.85  # 17 of 20 recordings with a turned-over object gave one right model (docs/method/suggestion.md)
-_LEAST_MASS: Final = 0.03  # of a bin of turns that is evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +242,7 @@ class Belief:
         bin_rad = 2.0 * np.pi / STEPS
         bins = np.round(TURNS_RAD / bin_rad).astype(np.intp)
         masses = np.bincount(bins - bins.min(), edge.masses)
-        kept = np.flatnonzero(masses >= _LEAST_MASS)
+        kept = np.flatnonzero(masses >= 0.03)
         shares = masses[kept] / masses[kept].sum()
         turns_rad = bin_rad * (kept + bins.min())
         return [

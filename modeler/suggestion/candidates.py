@@ -15,7 +15,6 @@ from modeler.suggestion.surface_cells import Stand
 from modeler.types import Array, Plane, RayImage
 
 Action = Literal["turn", "poke", "lay", "pose"]
-_PUSH_M = 0.03  # by which a finger moves: enough to turn an object of 10 cm by 20° or more
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def pokes(last: RayImage, stand: Stand, object_from_last: Array) -> list[Candida
         for ahead in (-1.0, 1.0):
             direction = last_from_stand[:3, :3] @ (ahead * towards)
             point = se3.transform(last_from_stand, at_m[None])[0]
-            push = Poke(_triple(point), _triple(direction), _PUSH_M)
+            push = Poke(_triple(point), _triple(direction), 0.03)  # 3 cm turn an object of 10 cm by 20° or more
             turn_rad = float(se3.log(poked(push, last, last.plane))[:3] @ last.plane.normal)
             found.append(Candidate("poke", turn_deg=float(np.degrees(turn_rad)), poke=push))
     return found

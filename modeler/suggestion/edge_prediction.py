@@ -43,8 +43,6 @@ Over 175 steps of 35 shapes of the tuning half, the predicted mass of the true m
 tempered; realised 0.63."""
 _CORE_RAD: Final = np.radians(6.0)  # two steps: nearer turns are described by the local Gaussian
 _LARGEST_STEP_RAD: Final = 0.1  # steps do not rotate, because of the damping
-_VALLEY: Final = np.exp(-2.0)  # relative to a mode's peak: separates two Gaussians two standard deviations apart each
-_MAX_EDGES: Final = 6  # newest edges used to scale predictions; they scatter by about a factor of two
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +138,7 @@ class EdgePredictor:
             if solution.takes_part(edge) and edge.source in views and edge.target in views and not edge.posterior.modes
         ]
         pairs, noises_m = [], []
-        for edge in used[-_MAX_EDGES:]:
+        for edge in used[-6:]:  # the newest; they scatter by about a factor of two
             pair = self.likelihood.between(
                 ready(views[edge.source]), ready(views[edge.target]), np.random.default_rng(0)
             )
@@ -367,7 +365,8 @@ def basins(places: Array, log_mass: Array) -> tuple[Array, Array]:
     joined = parts[:1]
     for start, stop in parts[1:]:
         before = mass[joined[-1][0] : joined[-1][1]].max()
-        if mass[start] > _VALLEY * min(before, mass[start:stop].max()):
+        # Separates two Gaussians two standard deviations apart each.
+        if mass[start] > np.exp(-2.0) * min(before, mass[start:stop].max()):
             joined[-1][1] = stop
         else:
             joined.append([start, stop])

@@ -13,7 +13,6 @@ from modeler.suggestion.belief import Belief, Prediction
 from modeler.suggestion.candidates import Candidate, pokes, turns
 
 _COARSE_DEG = 10.0  # between compared turns; between the last ones half of it, as turning by hand is not more precise
-_LYING_COST = 8.0  # a separate run: a full turn in steps of 45° at least
 _ALIKE = 0.9  # of the better gain: a turn is then equally good either way
 
 
@@ -125,7 +124,11 @@ def _default(belief: Belief) -> list[Prediction]:
     """Return predictions of actions of a person at a table; turns near the best ones are sampled more finely."""
     table = turntable_in(belief.prior)
     others = _predicted(
-        belief, [*pokes(belief.last, belief.stand, belief.object_from_last), Candidate("lay", cost=_LYING_COST)]
+        belief,
+        [
+            *pokes(belief.last, belief.stand, belief.object_from_last),
+            Candidate("lay", cost=8.0),
+        ],  # a turn in eight steps
     )
     if table is not None:
         return others + _predicted(belief, turns(abs(table.step_deg)))

@@ -26,7 +26,6 @@ CELLS = 40  # across the object: cells of 2 to 3 mm on objects of 10 cm, as wide
 _MARGIN_PX = 1  # around a pixel: silhouettes mix foreground and background
 _NEIGHBOURS, _REACH = 50, 7.0  # cells by which normals are smoothed, and how far apart at most, in cells
 _THINNED = 2  # every so many cells take part in smoothing, which halves the time
-_RIDGE = 1e-3  # where neighbours lie on a line
 _ALIKE = np.cos(np.radians(50.0))  # between normals of one face: edges stay
 _SURFACE_WITHIN, _SURFACE_BEYOND = 1.15, 0.24
 """Cells of new surface that a view shows per cell of hidden space seen head-on, fitted to 48 shapes of the tuning half
@@ -252,7 +251,7 @@ def smoothed(points_m: Array, normals: Array, cell_m: float, patch: float) -> tu
     offsets = (points_m[there] - points_m[:, None]) / (_REACH * cell_m)
     design = np.concatenate([np.ones((*offsets.shape[:2], 1)), offsets], axis=2)
     weighted = np.swapaxes(design * weights[:, :, None], 1, 2)
-    gram = weighted @ design + _RIDGE * np.diag([1.0, count, count, count])
+    gram = weighted @ design + 1e-3 * np.diag([1.0, count, count, count])  # where neighbours lie on a line
     found = np.linalg.solve(gram, weighted @ normals[there])
     mean = _unit(found[:, 0])
     close = weights * (np.sum(offsets**2, axis=2) < 0.25)

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from modeler.types import Frame, RayImage
 
 _Number = TypeVar("_Number", bound=np.generic)
-_ALIGNMENT = 64  # bytes, for every type of number
 
 
 class DiskArrays:
@@ -40,7 +39,7 @@ class DiskArrays:
         if self._chunk is None or self._filled + array.nbytes > len(self._chunk):
             self._chunk = self._mapped(max(self._chunk_bytes, array.nbytes))
         assert self._file is not None
-        offset, self._filled = self._filled, -(-(self._filled + array.nbytes) // _ALIGNMENT) * _ALIGNMENT
+        offset, self._filled = self._filled, -(-(self._filled + array.nbytes) // 64) * 64
         self._file.seek(offset)
         self._file.write(np.ascontiguousarray(array).data.cast("B"))
         self._file.flush()
@@ -136,5 +135,4 @@ class ViewStore:
 
 
 def _images(frame: Frame) -> list[npt.NDArray[np.generic]]:
-    """Return the images of a frame."""
     return [image for image in (frame.depth_m, frame.mask, frame.colour, frame.occluder) if image is not None]

@@ -9,8 +9,6 @@ import os
 import shlex
 import sys
 
-_M_ARENA_MAX = -8  # of mallopt(3)
-
 
 def share_one_heap() -> None:
     """Let all new threads allocate from one heap, instead of one per thread as in the C library.
@@ -19,7 +17,7 @@ def share_one_heap() -> None:
     allocate too seldom to wait for each other.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        mallopt(_M_ARENA_MAX, 1)
+        mallopt(-8, 1)  # M_ARENA_MAX of mallopt(3)
 
 
 def check_room(size: int) -> None:

@@ -21,7 +21,7 @@ class AbstractPoseDensity(ABC):
     uniform measure: the Haar measure of rotations, scaled as dω at the identity, times that of translations.
     """
 
-    evidence: bool
+    evidence: bool = True
     """True: independent evidence, which becomes part of the edge. False: a proposal, which only guides the search."""
 
     @abstractmethod

@@ -115,7 +115,6 @@ def inside(mesh: Mesh, points_m: Array) -> BoolArray:
 
 
 _COARSE_M, _FINE_M = 0.01, 0.001  # longest edges of triangles near a cut, and at it
-_SKIN_M = 1e-5  # off the surface: points on it are neither inside nor outside
 
 
 def outer_surface(mesh: Mesh) -> Mesh:
@@ -149,7 +148,7 @@ def _hidden(corners: Array, part: IntArray, others: list[Mesh]) -> BoolArray:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     centre = corners.mean(axis=1, keepdims=True)
     # Corners are drawn in a little, so that a corner that touches another part does not count as cut by it.
-    points = np.concatenate([centre, centre + 0.98 * (corners - centre)], axis=1) + _SKIN_M * normals[:, None]
+    points = np.concatenate([centre, centre + 0.98 * (corners - centre)], axis=1) + 1e-5 * normals[:, None]
     hidden = np.zeros(points.shape[:2], bool)
     for number, other in enumerate(others):
         asked = part != number

@@ -51,7 +51,6 @@ def mosaic_shade(points_m: Array, mosaic: Mosaic) -> Array:
 
 
 _MOTION, _READINGS, _FRAMES, _PHOTOGRAPHS, _SHIFTS = range(5)  # keys of the seed's branches
-_ALIGNED_PX = 0.1  # misalignment by interpolation of colours along the rays of depth, by hand
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,8 @@ class RenderedSequence(AbstractSequence):
         view, photography = self.recipe.view, self.recipe.photography
         shift_px = 0.0 if photography is None else np.sqrt(2.0) * photography.shift_px
         sigmas = self._sensor.sigmas(view.distance_m, view.focal_px, self.recipe.depth_unit_mm / 1000.0)
-        return SensorNoise(*sigmas, float(np.hypot(shift_px, _ALIGNED_PX)), sigma_focal=0.0)
+        # 0.1: colours interpolated along the rays of depth, by hand.
+        return SensorNoise(*sigmas, float(np.hypot(shift_px, 0.1)), sigma_focal=0.0)
 
     @property
     def motion(self) -> Mapping[str, Any] | None:

@@ -228,7 +228,6 @@ def _name(frame_id: str) -> str:
     return str(frame_id).removeprefix("/")
 
 
-FARTHEST_CAMERA_M = 10.0  # largest distance of two cameras of one device
 TEXT = "std_msgs/msg/String"
 _STREAM = r"(/device_\d+/sensor_\d+)/\w+"
 
@@ -294,7 +293,7 @@ def _pose(message: Any, where: str) -> Array:
         # Matrices of the camera's library stand column by column.
         pose = se3.translation(_numbers(entries.get("translation", ""), 3))
         pose[:3, :3] = _numbers(entries.get("rotation", ""), 9).reshape(3, 3).T
-    if not se3.is_rigid(pose, tolerance=1e-3, farthest_m=FARTHEST_CAMERA_M):
+    if not se3.is_rigid(pose, tolerance=1e-3, farthest_m=10.0):  # of one device
         raise InputError(f"{where}: is no rigid motion; record it again.")
     return pose
 

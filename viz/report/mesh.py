@@ -98,7 +98,6 @@ def scene(mesh: Mesh, strips_m: list[Array], object_from_upright: Array) -> Mapp
 
 
 def _packed(array: npt.NDArray[Any]) -> str:
-    """Return the bytes of an array as text."""
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 

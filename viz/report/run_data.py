@@ -78,9 +78,6 @@ class Result:
 Row = Mapping[str, Any]  # values of an entity by component
 
 
-_MAX_BYTES = 4 << 30  # Rerun reads the whole file into memory; 5,000 frames of 640×480 are as many
-
-
 def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
     """Return the rows of `READ` by frame; empty if nothing can be read.
 
@@ -91,7 +88,7 @@ def recorded(recording: Path) -> dict[str, dict[int, dict[str, Any]]]:
     if not os.path.lexists(recording):
         return rows
     check_regular(recording)
-    if recording.stat().st_size > _MAX_BYTES:
+    if recording.stat().st_size > (4 << 30):  # 5,000 frames of 640×480; Rerun reads all into memory
         return rows
     steps = steps_of(recording)
     for _, step in sorted(steps.items()):

@@ -60,7 +60,6 @@ def _verdict(poses: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _figures(poses: Sequence[Mapping[str, Any]]) -> str:
-    """Return key figures."""
     usable = sum(pose["usable"] for pose in poses)
     absent = sum(pose["outcome"] == "not there" for pose in poses)
     figures = (
@@ -72,7 +71,6 @@ def _figures(poses: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _table(poses: Sequence[Mapping[str, Any]], centre_m: Array) -> str:
-    """Return a row a frame."""
     heads = ("frame", "outcome", "rotation sd", "place sd", "modes", "overlap", "time")
     lines = []
     for pose in poses:
