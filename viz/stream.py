@@ -136,7 +136,7 @@ class Shown:
             self._behind = True
             _log.warning("the viewer takes no data any more; the run goes on without it")
 
-    def close(self, end_hung: Callable[[], None]) -> None:
+    def close(self, end_hung: Callable[[], object]) -> None:
         """Send the rest, and take leave.
 
         Args:
@@ -278,14 +278,10 @@ class RerunStream:
         if self.file is not None:
             self.file.close(self.recording)
         if self.shown is not None:
-            self.shown.close(self._end_viewers)
+            self.shown.close(lambda: [own.stop() for own in self.viewers])
         for own in self.viewers:
             if not own.lasting:
                 own.stop()
-
-    def _end_viewers(self) -> None:
-        for own in self.viewers:
-            own.stop()
 
 
 def graph_due(step: Step) -> bool:

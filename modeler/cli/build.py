@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from modeler.cli.console import Console, Interrupt, as_options, say
+from modeler.cli.console import Console, Interrupt, as_options, say, trusted_status
 from modeler.cli.options import MIN_VOXEL_M, FrameOptions, InputOptions, ModelOptions, given_options
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
@@ -173,9 +173,7 @@ def _go_on(options: Build, known: Path, frames: AbstractSequence) -> int:
     growth = Growth(options.where, options.given.overrides(), options.method.seed)
     done = growth.run(known, options.sequence, frames, options.out, overwrite=options.overwrite)
     say(f"{done.placed} of {done.frames} frames placed on the model of {known}: {options.out}")
-    if done.verdict.reasons:
-        say(f"not to be trusted: {done.verdict.reasons[0]}")
-    return 0 if done.verdict.trustworthy else 3
+    return trusted_status(done.verdict)
 
 
 def _check(options: Build) -> None:

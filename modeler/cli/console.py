@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache, partial
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from modeler.cli.messages import MESSAGES, is_quiet
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from modeler.suggestion import Belief, Suggestions
-    from modeler.types import AbstractPrior, Event, Outcome, Posterior, Reason, Step
+    from modeler.types import AbstractPrior, Event, Outcome, Posterior, Reason, Step, Verdict
 
 T = TypeVar("T")
 
@@ -69,6 +69,13 @@ def worded_as_options(record: logging.LogRecord) -> bool:
     """Put options for parameters in a record of the log; a filter that lets all pass."""
     record.msg, record.args = as_options(record.getMessage()), ()
     return True
+
+
+def trusted_status(verdict: Verdict) -> int:
+    """Say why a model is not to be trusted, and return the exit status."""
+    if verdict.reasons:
+        say(f"not to be trusted: {verdict.reasons[0]}")
+    return 0 if verdict.trustworthy else 3
 
 
 @contextlib.contextmanager
@@ -155,10 +162,8 @@ class Interrupt:
         self._listening.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._listening.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self._listening.__exit__(None, None, None)
 
     @property
     def asked(self) -> bool:
@@ -243,9 +248,7 @@ class Console:
             self._say(f"watch at {self._address}")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Stop the bar, and report the number of frames with doubtful masks."""
         from modeler.verdict.advice import outcome_advice
 

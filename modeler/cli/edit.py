@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from modeler.cli.console import say
+from modeler.cli.console import say, trusted_status
 from modeler.composition.options import SEED, default
 
 if TYPE_CHECKING:
-    from modeler.types import Verdict
+    pass
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Edit:
         say(f"{len(dropped)} of {len(frames)} frames taken out, {left} left: {out}")
         if unconnected:
             say(f"left out, too, as nothing else joins them to the rest: {', '.join(map(str, unconnected))}")
-        return _status(verdict)
+        return trusted_status(verdict)
 
 
 def _numbers(text: str, frames: Sequence[int]) -> list[int]:
@@ -109,14 +109,7 @@ class Join:
         say(f"models aligned: {100.0 * best.share:.3g} % likely{ways}")
         frames = len(report["poses"])
         say(f"{best.accepted} of {len(best.edges)} pairs registered, {frames} frames joined: {self.out}")
-        return _status(verdict)
-
-
-def _status(verdict: Verdict) -> int:
-    """Say why a model is not to be trusted, and return the exit status."""
-    if verdict.reasons:
-        say(f"not to be trusted: {verdict.reasons[0]}")
-    return 0 if verdict.trustworthy else 3
+        return trusted_status(verdict)
 
 
 def _check(options: Join) -> None:

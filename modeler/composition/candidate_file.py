@@ -31,10 +31,6 @@ class Turn:
     name: str = ""
     cost: float = Candidate.cost
 
-    def candidate(self) -> Candidate:
-        """Return it."""
-        return Candidate("turn", turn_deg=self.turn_deg, name=self.name, cost=self.cost)
-
 
 @dataclass(frozen=True)
 class Poke:
@@ -46,11 +42,6 @@ class Poke:
     name: str = ""
     cost: float = Candidate.cost
 
-    def candidate(self) -> Candidate:
-        """Return it."""
-        push = Push(self.point_m, self.direction, self.length_m)
-        return Candidate("poke", poke=push, name=self.name, cost=self.cost)
-
 
 @dataclass(frozen=True)
 class Lay:
@@ -58,10 +49,6 @@ class Lay:
 
     name: str = ""
     cost: float = Candidate.cost
-
-    def candidate(self) -> Candidate:
-        """Return it."""
-        return Candidate("lay", name=self.name, cost=self.cost)
 
 
 @dataclass(frozen=True)
@@ -85,10 +72,6 @@ class Pose:
         if not (0.0 < self.sigma_deg <= 180.0 and 0.0 < self.sigma_m <= 10.0):
             raise ValueError("sigma_deg must be above 0 and up to 180, sigma_m above 0 and up to 10")
 
-    def candidate(self) -> Candidate:
-        """Return it."""
-        return _reached(np.reshape(self.new_from_last, (4, 4)), self.name, self.cost, (self.sigma_deg, self.sigma_m))
-
 
 def read_candidates(path: Path) -> list[Candidate]:
     """Return the actions in a file.
@@ -103,7 +86,7 @@ def read_candidates(path: Path) -> list[Candidate]:
         if isinstance(tree.value, dict):  # TOML has no list at its top
             tree = tree.need("candidates")
         nodes = tree.elements()
-        found = [_named(build(Turn | Poke | Lay | Pose, node).candidate(), node) for node in nodes]
+        found = [_priced(_candidate(build(Turn | Poke | Lay | Pose, node)), node) for node in nodes]
     if not found:
         raise InputError(f"{path}: holds no candidates; give at least one")
     if len(found) > _MOST:
@@ -111,7 +94,19 @@ def read_candidates(path: Path) -> list[Candidate]:
     return found
 
 
-def _named(candidate: Candidate, node: Node) -> Candidate:
+def _candidate(asked: Turn | Poke | Lay | Pose) -> Candidate:
+    match asked:
+        case Turn(turn_deg, name, cost):
+            return Candidate("turn", turn_deg=turn_deg, name=name, cost=cost)
+        case Poke(point_m, direction, length_m, name, cost):
+            return Candidate("poke", poke=Push(point_m, direction, length_m), name=name, cost=cost)
+        case Lay(name, cost):
+            return Candidate("lay", name=name, cost=cost)
+        case Pose(motion, name, cost, sigma_deg, sigma_m):
+            return _reached(np.reshape(motion, (4, 4)), name, cost, (sigma_deg, sigma_m))
+
+
+def _priced(candidate: Candidate, node: Node) -> Candidate:
     if not (candidate.cost > 0.0 and math.isfinite(candidate.cost)):
         raise InputError(f"{node.path}: {node.where}: cost must be positive")
     return candidate
