@@ -67,17 +67,22 @@ def moved(pose: Array, xi: Array, about_m: Array) -> Array:
 
     C is the shift to the point: about an object's centre, rotation and translation are least correlated.
     """
-    shape = np.broadcast_shapes(np.shape(pose)[:-2], np.shape(xi)[:-1])
-    poses = np.broadcast_to(np.asarray(pose, dtype=np.float64), (*shape, 4, 4)).reshape(-1, 4, 4)
-    steps = np.broadcast_to(np.asarray(xi, dtype=np.float64), (*shape, 6)).reshape(-1, 6)
-    return lie_group.retract_all(poses, steps, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 4, 4)
+    poses, steps = np.ascontiguousarray(pose, dtype=np.float64), np.ascontiguousarray(xi, dtype=np.float64)
+    if poses.shape[:-2] != steps.shape[:-1]:
+        shape = np.broadcast_shapes(poses.shape[:-2], steps.shape[:-1])
+        poses, steps = np.broadcast_to(poses, (*shape, 4, 4)).copy(), np.broadcast_to(steps, (*shape, 6)).copy()
+    point_m = np.asarray(about_m, dtype=np.float64)
+    return lie_group.retract_all(poses.reshape(-1, 4, 4), steps.reshape(-1, 6), point_m).reshape(poses.shape)
 
 
 def difference(first: Array, second: Array, about_m: Array) -> Array:
     """Return the ξ (..., 6) by which `moved` takes motions (..., 4, 4) to others, about a point (3,)."""
-    shape = np.broadcast_shapes(np.shape(first)[:-2], np.shape(second)[:-2])
-    one, other = (rows(np.broadcast_to(poses, (*shape, 4, 4))).reshape(-1, 12) for poses in (first, second))
-    return lie_group.differences(one, other, np.asarray(about_m, dtype=np.float64)).reshape(*shape, 6)
+    one, other = rows(first), rows(second)
+    if one.shape != other.shape:
+        shape = np.broadcast_shapes(one.shape, other.shape)
+        one, other = np.broadcast_to(one, shape).copy(), np.broadcast_to(other, shape).copy()
+    found = lie_group.differences(one.reshape(-1, 12), other.reshape(-1, 12), np.asarray(about_m, dtype=np.float64))
+    return found.reshape(*one.shape[:-1], 6)
 
 
 def adjoint(pose: Array) -> Array:

@@ -88,6 +88,16 @@ def test_a_kernel_is_compiled_again_once_a_function_inlined_in_it_has_changed(to
     assert not before.exists()
 
 
+def test_a_kernel_from_the_cache_is_linked_with_one_that_is_compiled(toy: Path) -> None:
+    (toy / "toy" / "inner.py").write_text(_INNER.format(1).replace(", inline='always'", ""))
+    called(toy)
+    (outer,) = (path for path in files(toy) if path.name.startswith("outer."))
+    outer.unlink()
+    first, compiled, *_ = called(toy)
+    assert first == "2.0"
+    assert int(compiled) > 0
+
+
 def flip(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1

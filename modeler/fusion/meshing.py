@@ -93,10 +93,10 @@ def measured(grid: VoxelGrid, views: ViewBlocks, *, tau_m: float, empty_weight: 
         weight += share
         distance += np.divide(share, weight, out=np.ones_like(share), where=weight > 0.0) * (value - distance)
     x, y, z = (int(n) for n in grid.blocks)
-    values, weights = (np.zeros((x, y, z, tsdf.SIDE, tsdf.SIDE, tsdf.SIDE), dtype=np.float32) for _ in range(2))
-    values[near], weights[near] = distance, weight
-    values = values.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
-    weights = weights.transpose(0, 3, 1, 4, 2, 5).reshape(grid.shape)
+    values, weights = (np.zeros(grid.shape, dtype=np.float32) for _ in range(2))
+    for image, of_blocks in ((values, distance), (weights, weight)):
+        by_block = image.reshape(x, tsdf.SIDE, y, tsdf.SIDE, z, tsdf.SIDE).transpose(0, 2, 4, 1, 3, 5)  # a view
+        by_block[near] = of_blocks
     for axis in range(3):
         np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
     return DistanceField(grid, values, weights)

@@ -28,9 +28,13 @@ import llvmlite.binding
 import numba
 import numpy as np
 from numba.core.caching import _Cache  # pyright: ignore[reportPrivateUsage]
+from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
+
+with suppress(AttributeError):  # each call of LLVM is announced, 200 a kernel, to nobody
+    llvmlite.binding.ffi.lib._lock._cblist.clear()
 
 _HERE: Final = Path(__file__).parent
 _DIGEST_BYTES: Final = 32
@@ -53,7 +57,7 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
 
 def folder() -> Path:
     """Return the folder in which kernels are kept first of all."""
-    return _folders()[0]
+    return next(_folders())
 
 
 def writable() -> Path | None:
@@ -88,7 +92,8 @@ class KernelCache(_Cache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled code for a signature; None if there is none that can be relied on."""
         rtsys.initialize(target_context)  # all that code needs; what a compilation looks up takes 0.2 s to import
-        name = self._file_name(sig, target_context.codegen())
+        codegen = target_context.codegen()
+        codegen._library_class, name = _Library, self._file_name(sig, codegen)
         for folder in _folders():
             content = _content(folder / name)
             if content is not None:
@@ -122,18 +127,48 @@ class KernelCache(_Cache):
         return f"{self._name}-{hashlib.sha256(key).hexdigest()[:16]}"
 
 
-def _folders() -> list[Path]:
-    """Return where kernels are read and written, in this order.
+class _Library(JITCodeLibrary):
+    """Compiled code, of whose intermediate form nothing is read from the cache before another kernel inlines it.
+
+    Numba parses it, and asks LLVM for each of its names, which takes more than half of the time of loading a kernel.
+    """
+
+    _unread: bytes = b""
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> _Library:
+        name, _, (code, unread) = state
+        library = codegen.create_library(name)
+        library._unread = unread
+        library.enable_object_caching()
+        library._set_compiled_object(code)
+        library._finalize_final_module()
+        return library
+
+    def _get_module_for_linking(self) -> Any:
+        if self._unread:
+            self._shared_module, self._unread = llvmlite.binding.parse_bitcode(self._unread), b""
+            self._codegen._engine._load_defined_symbols(self._shared_module)
+        return super()._get_module_for_linking()
+
+    def get_pointer_to_function(self, name: str) -> int:
+        engine = self._codegen._engine
+        return engine.get_function_address(name) if self._unread else super().get_pointer_to_function(name)
+
+
+def _folders() -> Iterator[Path]:
+    """Yield where kernels are read and written, in this order.
 
     Where Numba's setting says or the sources are, the user's folder for such files, and that of temporary files.
     """
+    name, own = f"kernels-{_MACHINE}-{_SOURCES}", os.environ.get("NUMBA_CACHE_DIR")
+    yield (Path(own).absolute() if own else _HERE / "__pycache__") / name
     user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    own = os.environ.get("NUMBA_CACHE_DIR")
-    first = Path(own).absolute() if own else _HERE / "__pycache__"
-    places = [first, Path(user) / "modeler"] if os.path.isabs(user) else [first]
+    if os.path.isabs(user):
+        yield Path(user) / "modeler" / name
     temporary = Path(os.environ.get("TMPDIR") or "/tmp") / f"modeler-{os.geteuid()}"
-    places += [temporary] if temporary.is_absolute() and _is_private(temporary) else []
-    return [place / f"kernels-{_MACHINE}-{_SOURCES}" for place in places]
+    if temporary.is_absolute() and _is_private(temporary):
+        yield temporary / name
 
 
 def _is_private(place: Path) -> bool:

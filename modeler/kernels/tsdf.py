@@ -252,7 +252,7 @@ def _observe(
                 shown[count, c] = gains[f, c] * math.exp(shade) * between(colour[f], u, v, c)
                 levels[count] += shown[count, c]
             count += 1
-        usual = _weighted_median(levels[:count], shares[:count, 0])
+        usual = _weighted_median(levels[:count], shares[:count, 0]) if count > 1 else levels[0]
         for k in range(count):
             share = shares[k, 1] / (1.0 + (max(0.0, math.log(levels[k] / usual)) / HIGHLIGHT) ** 2)
             colours[q, 3] += share

@@ -336,7 +336,7 @@ class PairLikelihood:
         found = gauss_newton.normal_equations(
             rows_under(poses, log_focal), self.surfaces(stride), colours, weight, self.centre_m, noise.surface_m
         )
-        (gradients, of_colour), (equations, by_colour) = (stride * np.moveaxis(part, 1, 0) for part in found)
+        (gradients, of_colour), (equations, by_colour) = (stride * part.swapaxes(0, 1) for part in found)
         if self.colour is not None:
             kept = without_shift(by_colour, self.colour.shifts(poses))
             gradients = gradients + (kept @ of_colour[:, :, None])[:, :, 0]
@@ -380,7 +380,7 @@ class PairLikelihood:
             weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
         colours = self._colours(band, stride)
         _, (of_surface, of_colours) = (
-            np.moveaxis(part, 1, 0)
+            part.swapaxes(0, 1)
             for part in gauss_newton.normal_equations(
                 rows(poses), self.surfaces(stride), colours, np.float32(weight), self.centre_m, blur_m
             )
