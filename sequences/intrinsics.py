@@ -265,7 +265,6 @@ _COEFFICIENTS = (
     "dist", "D", "d",
 )  # fmt: skip
 _BY_NAME = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE_BY_NAME = ("k1", "k2", "k3", "k4")
 
 
 def _distortion(node: Node) -> tuple[float, ...]:
@@ -283,7 +282,7 @@ def _distortion(node: Node) -> tuple[float, ...]:
     if prefix is None:
         return ()
     fisheye = node.get("p1") is None and node.get(f"{prefix}p1") is None and node.get(f"{prefix}k4") is not None
-    names = _FISHEYE_BY_NAME if fisheye else _BY_NAME
+    names = ("k1", "k2", "k3", "k4") if fisheye else _BY_NAME
     values = (node.get(f"{prefix}{name}") for name in names)
     return tuple(0.0 if value is None else value.number() for value in values)
 

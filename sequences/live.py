@@ -135,15 +135,14 @@ def _next(camera: RunningCamera, number: int, after_s: float | None) -> Frame:
     raise InputError(f"{camera.name}: gives the same image again and again; reconnect it.")
 
 
-WARM_UP = 30  # images after which exposure has settled
 TIMEOUT_MS = 5000  # a camera that gives nothing for so long is gone
 REACH_M = 16.0  # depth of a live camera beyond this is a measurement error; less fits 16 bits of a fine unit
 _TIME_OF_FLIGHT = ("Azure Kinect", "Femto", "L515")
 """Names of models that measure so; others see structured light or stereo pairs."""
 
 
-def opened(camera: RunningCamera, overrides: Overrides, warm_up: int = WARM_UP) -> LiveSequence:
-    """Return the images of a camera that was started, which is stopped once it is forgotten."""
+def opened(camera: RunningCamera, overrides: Overrides, warm_up: int = 30) -> LiveSequence:
+    """Return the images of a started camera but the first, until exposure settles; once forgotten, it is stopped."""
     if overrides.intrinsics is not None:
         size = camera.lens.camera.width, camera.lens.camera.height
         camera = replace(camera, lens=Lens(Camera(*size, *overrides.intrinsics), ()))

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from modeler.cli.console import bar, say
 from modeler.sequences import AbstractSequence, Overrides, WatchLimits, watch
@@ -28,14 +27,6 @@ class ObservedSequence(AbstractDerived):
         return frame
 
 
-class Watched(Protocol):
-    """From a sequence to the same sequence, watched."""
-
-    def __call__(self, sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
-        """Add a bar for a sequence, labelled with the operation on its frames."""
-        ...
-
-
 def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
     """Yield the frames of a camera; a failure ends them with a line on stderr, as they cannot be read again."""
     try:
@@ -45,14 +36,14 @@ def while_it_lasts(camera: AbstractSequence) -> Iterator[Frame]:
 
 
 @contextmanager
-def reading() -> Iterator[Watched]:
-    """Show a progress bar on stderr for each sequence as its frames are read; hidden if that is no terminal.
+def reading() -> Iterator[Callable[..., AbstractSequence]]:
+    """Yield what gives a sequence a progress bar on stderr as its frames are read; hidden if that is no terminal.
 
-    A sequence that is still being written is unchanged.
+    It takes the sequence, and what is done with its frames in words. One that is still being written is unchanged.
     """
     with bar() as progress:
 
-        def watched(sequence: AbstractSequence, what: str = "", /) -> AbstractSequence:
+        def watched(sequence: AbstractSequence, what: str = "") -> AbstractSequence:
             if sequence.live:
                 return sequence
             task = progress.add_task(what, total=len(sequence))

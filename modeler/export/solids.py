@@ -21,7 +21,6 @@ from modeler.types import Array, InputError, ObjectModel, area_vectors_m2, areas
 HULL_TRIANGLES = 500  # most triangles of a convex part; a ball then loses 3 % of its volume
 # For CoACD: of a bear of 0.13 m, 1500 triangles became 15 parts with 5 % more volume in 9 s on two busy cores; with its
 # own settings and 8000 triangles, 70 parts in five minutes.
-PART_TRIANGLES = 1_500  # triangles of the mesh from which convex parts are found
 _SEARCH: Mapping[str, Any] = {"threshold": 0.08, "resolution": 800, "mcts_nodes": 10, "mcts_iterations": 30}
 
 
@@ -88,7 +87,7 @@ def convex_parts(model: ObjectModel) -> ConvexParts:
     import coacd  # pyright: ignore[reportMissingImports]
 
     coacd.set_log_level("error")
-    coarse = simplified(model, PART_TRIANGLES)
+    coarse = simplified(model, 1_500)
     mesh = coacd.Mesh(coarse.vertices_m, coarse.triangles.astype(np.int32))
     found = coacd.run_coacd(mesh, seed=0, **_SEARCH)
     parts = tuple(_hull(np.asarray(vertices, dtype=np.float64)) for vertices, _ in found)

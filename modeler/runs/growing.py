@@ -44,8 +44,6 @@ _WHY: Final = Stated("it agrees with the place of the frame on the model")
 class Grown:
     """Result of going on with a model."""
 
-    report: Mapping[str, Any]
-    """As in report.json."""
     verdict: Verdict
     """Whether the model can be trusted."""
     placed: int
@@ -123,7 +121,8 @@ class Growth:
         solution = solve(graph, {k: pose for k, pose in {**poses, **placed}.items() if k in kept})
         shown = [edge for edge in edges if edge.source in views_kept and edge.target in before.views]
         work = Work((before, second), graph, solution, shown, began_s)
-        return Grown(*write_run(out, work, meta, overwrite=overwrite), len(views_kept), len(frames.indices))
+        _, verdict = write_run(out, work, meta, overwrite=overwrite)
+        return Grown(verdict, len(views_kept), len(frames.indices))
 
     def _placed(self, model: ObjectModel, part: Part, views: Sequence[RayImage]) -> list[Tracked]:
         """Return the model in views of the recording, followed from each to the next."""

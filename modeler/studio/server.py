@@ -168,7 +168,6 @@ def _with_headers(send: Send) -> Send:
 
 HOST: Final = "127.0.0.1"
 _OF_RUN: Final = ("report.html", "recording.rrd")
-_VIEWER_FILE: Final = re.compile(r"[\w.-]{0,64}")
 _ELSEWHERE: Final = re.compile(rb"<link[^>]*https://[^>]*>")
 
 
@@ -328,7 +327,7 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
     @app.get("/viewer/{name}")
     @app.get("/viewer/")
     def of_viewer(name: str = "") -> Response:
-        found = viewers.file(name) if _VIEWER_FILE.fullmatch(name) else None
+        found = viewers.file(name) if re.compile(r"[\w.-]{0,64}").fullmatch(name) else None
         return Response(status_code=404) if found is None else Response(found[0], media_type=found[1])
 
     @app.get("/take-away/{name}/{file}")

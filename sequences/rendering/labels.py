@@ -16,8 +16,6 @@ from modeler.sequences.meshes import IntArray, Mesh
 from modeler.system.pictures import linear_light
 from modeler.types import Array, BoolArray, Float32Array, InputError
 
-STEEP = np.sqrt(0.5)  # surface tilted from upright by more than 45 degrees counts as facing up or down
-
 
 @dataclass(frozen=True)
 class Chart:
@@ -96,7 +94,8 @@ class Cylindrical:
         low_m, high_m = self._heights_m(mesh)
         x, y, z = surfels.points_m.T
         v = (high_m - z) / (high_m - low_m)
-        covered = (v >= 0.0) & (v <= 1.0) & (np.abs(surfels.normals[:, 2]) <= STEEP)
+        # What is tilted from upright by more than 45° counts as facing up or down.
+        covered = (v >= 0.0) & (v <= 1.0) & (np.abs(surfels.normals[:, 2]) <= np.sqrt(0.5))
         return Places(np.where(covered, 0, -1), _turn(x, y), v)
 
 
@@ -200,7 +199,6 @@ def _middle(mesh: Mesh) -> Array:
 Rgb = npt.NDArray[np.uint8]
 
 _FINE = 2  # number of pixels per texel along each side when prints are drawn
-LARGEST_PX = 4096  # images are at most this wide and high
 
 
 def gamma_coded(light: Array) -> Array:
@@ -395,7 +393,7 @@ class Texture:
 
 def _size_px(chart: Chart, texel_m: float) -> tuple[int, int]:
     """Return height and width of a chart's image."""
-    height, width = (int(np.clip(np.ceil(m / texel_m), 1, LARGEST_PX)) for m in (chart.height_m, chart.width_m))
+    height, width = (int(np.clip(np.ceil(m / texel_m), 1, 4096)) for m in (chart.height_m, chart.width_m))
     return height, width
 
 

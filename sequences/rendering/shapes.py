@@ -109,8 +109,6 @@ def _welded(vertices: Array, triangles: IntArray) -> Mesh:
     return Mesh.single(vertices[first], triangles[distinct])
 
 
-ROUNDNESS_M = 15e-6  # largest distance of facets of round shapes from the true surface in m
-
 _UNIT_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _CUBE_FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 
@@ -333,7 +331,8 @@ def placement(offset_m: tuple[float, float, float], rotation_deg: tuple[float, f
 
 def _sides(radius_m: float) -> int:
     """Return how many facets make a circle of a radius round enough; a multiple of four."""
-    return 4 * int(np.clip(np.ceil(np.pi / np.sqrt(2.0 * ROUNDNESS_M / radius_m) / 4.0), 4, 128))
+    # Facets are off by 15 µm at most.
+    return 4 * int(np.clip(np.ceil(np.pi / np.sqrt(2.0 * 15e-6 / radius_m) / 4.0), 4, 128))
 
 
 def _arc(start_deg: float, stop_deg: float, sides: int) -> Array:

@@ -188,14 +188,13 @@ def _whole(unpacked: bytes, *, ended: bool, most: int) -> bytes:
 _ROS1 = b"#ROSBAG V"
 _MCAP = b"\x89MCAP0\r\n\x01"  # magic bytes: the format, and the start of a header
 _PROFILE_AT = 21  # behind the header's length and that of the profile's name
-_ROS1_SCHEMA = "ros1msg"  # name of ROS 1 message definitions in MCAP
 
 
 def _definition(
     schema: storage_mcap.Schema | None, known: Callable[[storage_mcap.Schema | None], MessageDefinition]
 ) -> MessageDefinition:
     """Return the definition of a message, also of ROS 1, which the library has no name for."""
-    if schema is not None and schema.encoding == _ROS1_SCHEMA:
+    if schema is not None and schema.encoding == "ros1msg":
         return MessageDefinition(MessageDefinitionFormat.MSG, schema.data)
     return known(schema)
 

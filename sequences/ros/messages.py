@@ -183,7 +183,6 @@ def _rows(message: Any, bytes_a_pixel: int, where: str) -> npt.NDArray[np.uint8]
     return np.ascontiguousarray(rows[:, :needed])
 
 
-STATIC = "tf2_msgs/msg/TFMessage"
 FARTHEST_M = 1e4  # no robot is larger
 MOST = 1000  # messages of fixed transforms that are read; drivers send one or a few
 
@@ -193,7 +192,9 @@ def static_transform(bag: Bag, target: str, source: str) -> Array | None:
     if not target or not source:
         return None
     steps: dict[str, list[tuple[str, Array]]] = {}
-    for topic in (name for name, kind in bag.types.items() if kind == STATIC and name.endswith("tf_static")):
+    for topic in (
+        name for name, kind in bag.types.items() if kind == "tf2_msgs/msg/TFMessage" and name.endswith("tf_static")
+    ):
         for _, message in bag.messages(topic, most=MOST):
             for stamped in message.transforms:
                 parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)

@@ -184,7 +184,6 @@ for (const button of document.querySelectorAll('.mask button'))
 large.onclick = () => large.close();
 """
 _SIZE: Final = (150, 200)  # height and width in px
-_MASK_SIZE: Final = (360, 480)  # as large as it has room beside its words
 _MARKS_RGB: Final = ((31, 143, 155), (217, 115, 13), (200, 69, 63))
 """Of free space with surface of others, of surface in the free space of others, and of false surface."""
 
@@ -238,7 +237,7 @@ def thumbnails(rows: Mapping[str, Mapping[int, Row]], report: Mapping[str, Any])
 
 def size_px(frames: int, *, doubtful: bool) -> tuple[int, int]:
     """Return height and width of a frame's picture, of so many: of more than 100, only doubtful ones are large."""
-    return _MASK_SIZE if doubtful or frames <= 100 else _SIZE
+    return (360, 480) if doubtful or frames <= 100 else _SIZE  # as large as it has room beside its words
 
 
 def with_outline(rows: Mapping[str, Mapping[int, Row]], frame: int, size: tuple[int, int]) -> bytes | None:
