@@ -164,11 +164,12 @@ def test_units_and_principal_points_that_are_plainly_wrong_are_refused(
     (folder / "camera.json").write_text(json.dumps(change(facts)))
     (error,) = survey(open_sequence(folder)).plain_errors
     assert says in error
-    assert main(["build", str(folder), "--out", str(tmp_path / "run")]) == 2
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1
-    assert said.endswith("(or --despite-doubts)\n")
-    assert says in said
+    for command in (["build"], ["track", str(bundled("box") / "model.ply")]):
+        assert main([*command, str(folder), "--out", str(tmp_path / "run")]) == 2
+        said = capfd.readouterr().err
+        assert said.count("\n") == 1
+        assert said.endswith("(or --despite-doubts)\n")
+        assert says in said
     given = Overrides((camera.fx, camera.fy, camera.cx, camera.cy), change(facts)["depth_scale"])
     assert not survey(open_sequence(folder, given)).plain_errors
 

@@ -84,18 +84,25 @@ class Track:
         return _summarise(found, self.out)
 
     def _opened(self, thing: KnownObject) -> tuple[AbstractSequence, AbstractSequence]:
-        """Return the sequence, and the selected frames."""
+        """Return the sequence, and the selected frames; those that are plainly not what they seem are refused."""
         from modeler.cli.reading import watched
         from modeler.runs.reopening import calibrated
-        from modeler.sequences import frame_range, open_sequence
+        from modeler.sequences import KeptSequence, frame_range, open_sequence, survey
 
         overrides = self.given.overrides()
         whole = (
             watched(self.sequence, overrides, self.idle_s) if self.watch else open_sequence(self.sequence, overrides)
         )
+        whole = whole if whole.live else KeptSequence(whole)
         whole = calibrated(whole, self.sensor, self.camera)
         whole = whole if self.camera is not None else thing.seen_by(whole)
-        return whole, whole.select(every=self.selection.every, frames=frame_range(self.selection.frames))
+        frames = whole.select(every=self.selection.every, frames=frame_range(self.selection.frames))
+        if not frames.live:
+            found = survey(frames, truth=False)
+            found.check(frames.name, despite_doubts=self.given.despite_doubts)
+            for doubt in found.doubts:
+                say(doubt)
+        return whole, frames
 
     def _tracker(self, thing: KnownObject, sequence: AbstractSequence) -> Tracker:
         """Return the tracker with the parts asked for."""
