@@ -19,6 +19,7 @@ from modeler.runs.known_objects import known_object
 from modeler.sequences.rendering.recipe import Viewpoint
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.tracking import ModelRenderer, Tracked, Tracker
+from modeler.tracking.candidates import CandidateFinder
 from modeler.tracking.tracked import of_the_camera, of_the_model
 from modeler.types import Array, Camera, Frame, InputError, ObjectModel, PoseGaussian
 from modeler.views import Sensor
@@ -107,6 +108,33 @@ def test_an_object_is_found_and_followed_without_masks() -> None:
         assert found.outcome == ("found" if frame.index == 0 else "followed")
         assert found.pose is not None
         assert np.degrees(se3.rotation_angle(se3.inverse(found.pose.mean) @ truth[frame.index])) < 1.5
+
+
+@pytest.mark.parametrize("between_m", [0.4, 0.0, 2.0])
+def test_parts_of_an_object_are_one_piece_if_what_is_between_them_is_hidden(between_m: float) -> None:
+    renderer, finder = ModelRenderer(model_of(trimesh.creation.box((0.27, 0.11, 0.02)))), CandidateFinder()
+    depth_m = np.full((480, 640), 2.0, np.float32)
+    left, right = (np.zeros(depth_m.shape, dtype=bool) for _ in range(2))
+    left[200:280, 220:300], right[200:280, 340:420] = True, True
+    depth_m[left | right], depth_m[150:330, 300:340] = 0.8, between_m
+    masks = finder.masks(finder.things(Frame(0, 0.0, depth_m, CAMERA), renderer), renderer)
+    shares = np.array([[np.mean(mask[part]) for part in (left, right)] for mask in masks])
+    assert np.all(shares.max(axis=0) > 0.9)
+    assert np.any(shares.min(axis=1) > 0.9) == (between_m < 0.8)
+
+
+def test_what_hides_an_object_is_left_out_of_its_mask_and_surface_that_goes_on_is_not() -> None:
+    renderer, finder = ModelRenderer(model_of(trimesh.creation.box((0.2, 0.2, 0.02)))), CandidateFinder()
+    pose = se3.translation(np.array([0.0, 0.0, 0.81]))
+    for before_m, left_out in ((0.76, True), (0.79, False)):
+        depth_m = np.full((480, 640), 2.0, np.float32)
+        depth_m[165:315, 245:395], depth_m[200:250, 300:360] = 0.8, before_m
+        things = finder.things(Frame(0, 0.0, depth_m, CAMERA), renderer)
+        near = finder.near(things.frame, pose, renderer, things)
+        assert near[225, 330]
+        bare = finder.bared(things, near, pose, renderer)
+        assert (bare is not None) == left_out
+        assert bare is None or (bare[180, 260] and not bare[225, 330])
 
 
 @pytest.mark.parametrize("there", quick_first([True, False]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,8 @@ _RIM_SHARE = 0.05  # of the image's width: wide enough for second differences of
 _FREE_RIM = 0.4  # share of the rim that a near object and the arm that holds it leave free
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
 Labels = npt.NDArray[np.int32]
-_JUMP_SHARE = 0.03  # relative depth difference of neighbours beyond which they lie on two surfaces
+JUMP_SHARE: Final = 0.03
+"""Relative depth difference of neighbours beyond which they lie on two surfaces."""
 _GRID_CELLS = 80  # largest number of voxels along a side
 _GRAZING = np.tan(np.radians(85.0))  # surfaces at a more grazing angle are indistinguishable from mixed pixels
 _SPECK_SHARE = 0.003  # share of a mask; smaller pieces are removed
@@ -212,7 +213,7 @@ def pieces(depth_m: Float32Array, within: BoolArray, jump_m: float | None = None
         jump_m: the least jump; None: a share of the depth.
     """
     kept = within.copy()
-    limit = np.float32(_JUMP_SHARE) * depth_m if jump_m is None else np.full_like(depth_m, jump_m)
+    limit = np.float32(JUMP_SHARE) * depth_m if jump_m is None else np.full_like(depth_m, jump_m)
     kept[:-1] &= ~(np.abs(depth_m[1:] - depth_m[:-1]) > limit[1:])
     kept[:, :-1] &= ~(np.abs(depth_m[:, 1:] - depth_m[:, :-1]) > limit[:, 1:])
     return _label(kept)

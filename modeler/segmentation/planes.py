@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,8 @@ _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlat
 _CELL_PX = 5
 _MAX_HYPOTHESES = 200
 _MOST_PLANES = 10
+LEAST_SHARE: Final = 0.006
+"""Share of an image that a dominant plane covers at least."""
 _UPRIGHT = 0.2  # least upward (-y) component of the normal of a plane that faces up
 _SAME_DIRECTION = np.cos(np.radians(20.0))  # between the normals of a cell and its plane
 _LEVEL = np.cos(np.radians(2.0))
@@ -177,7 +179,7 @@ class _Cells:
 
 
 def dominant_planes(
-    points: Float32Array, noise: DepthNoise, *, least_share: float = 0.006, prefer_level: bool = False
+    points: Float32Array, noise: DepthNoise, *, least_share: float = LEAST_SHARE, prefer_level: bool = False
 ) -> Array:
     """Find the planes that cover most of an image, largest first.
 

@@ -79,6 +79,8 @@ class ViewpointSearch:
     """Of these, the best descend."""
     refined: int = 24
     """Best poses of all viewpoints that descend once more, in a view of the model where they ended."""
+    rivals: int = 12
+    """Of these, most that descend a last time, in views as fine as the frame."""
     coarse: VisibilityLikelihood = field(default_factory=lambda: VisibilityLikelihood(points=240, colour=False))
     """Compares the frame with viewpoints."""
     fine: VisibilityLikelihood = field(default_factory=lambda: VisibilityLikelihood(points=300))
@@ -131,7 +133,8 @@ class ViewpointSearch:
             ]
 
         near, scores = _ranked([rough, *descended(rough[0][: self.refined], self.coarse, COARSE_PX)])
-        return _ranked(descended(near[scores > scores[:1] - RIVAL_NATS], self.fine, MOST_PX))
+        rivals = near[scores > scores[:1] - RIVAL_NATS][: self.rivals]
+        return _ranked(descended(rivals, self.fine, MOST_PX))
 
     def _from_viewpoint(
         self, viewpoints: Viewpoints, number: int, view: RayImage, source: Array, rng: np.random.Generator

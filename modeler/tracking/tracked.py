@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -16,6 +17,10 @@ Presence = Literal["found", "followed", "unsure", "not there", "too few points"]
 
 USABLE_RAD, USABLE_M = np.radians(3.0), 0.005
 """Largest standard deviations, of a rotation and of the object's place, with which a pose is of use."""
+
+
+DOUBT: Final = 0.02
+"""Probability of another object or place up to which an answer is sure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,3 +120,44 @@ def free_directions(symmetries: Symmetries, *, coloured: bool) -> Array:
     for axis in found.continuous:
         covariance += np.pi**2 / 3.0 * np.outer(axis.turn, axis.turn)
     return covariance
+
+
+def likeliest(placed: Sequence[tuple[float, Tracked]], renderer: ModelRenderer) -> Tracked:
+    """Return the likeliest of some places or poses of one object in a frame, in doubt if others are about as likely.
+
+    Args:
+        placed: with the log odds (nats) of each.
+        renderer: of the model.
+    """
+    most, best = max(placed, key=lambda one: one[0])
+    for odds, other in placed:
+        if other is best or odds < most + np.log(DOUBT):
+            continue
+        assert best.pose is not None
+        assert other.pose is not None
+        if not holds(best, se3.transform(other.pose.mean, renderer.centre_m[None])[0], renderer):
+            return replace(best, outcome="unsure", usable=False, reason="several places explain the image")
+        if not same(best.pose, other.pose):
+            best = replace(best, usable=False, reason="several poses explain the image")
+    return best
+
+
+def holds(found: Tracked, place_m: Array, renderer: ModelRenderer) -> bool:
+    """Return whether a place (3,) is where an object was found."""
+    assert found.pose is not None
+    centre_m = se3.transform(found.pose.mean, renderer.centre_m[None])[0]
+    return float(np.linalg.norm(place_m - centre_m)) < renderer.radius_m
+
+
+def of_motion(motion: PoseGaussian, rendered: Array) -> PoseGaussian:
+    """Return camera_from_model, from the motion from the frame to the model rendered in a pose (4, 4)."""
+    back = motion.inverse()  # inv(M) Exp(η) T = inv(M) T Exp(Ad(T⁻¹) η)
+    moved = se3.adjoint(se3.inverse(rendered))
+    return PoseGaussian(back.mean @ rendered, moved @ back.covariance @ moved.T, moved @ back.by_focal)
+
+
+def same(one: PoseGaussian, other: PoseGaussian) -> bool:
+    """Return whether two poses are within two standard deviations of each other, or of a degree."""
+    xi = se3.log(se3.inverse(one.mean) @ other.mean)
+    spread = 0.5 * (one.covariance + other.covariance)
+    return bool(xi @ np.linalg.solve(spread, xi) < 4.0 or np.linalg.norm(xi[:3]) < np.radians(1.0))
