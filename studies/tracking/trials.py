@@ -22,7 +22,7 @@ from modeler.segmentation import Scene as Segmented
 from modeler.sequences import open_sequence
 from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.tracking import Tracked, Tracker
-from modeler.types import Array, Frame, ObjectModel, RayImage
+from modeler.types import Array, Frame, ObjectModel, PoseGaussian, RayImage
 from modeler.views import Sensor
 from studies.calibration.specimens import SPECIMENS, Half, load_specimen
 from studies.calibration.study import Condition, staged
@@ -30,6 +30,7 @@ from studies.tracking.baselines import ModelCloud, methods
 from studies.tracking.clutter import VIEWS, model_of, mssd_m, noise, scene
 
 OURS: Final = "modeler track"
+OURS_FROM_LAST: Final = f"{OURS} from the last pose"
 DEG, M, MSSD = 5.0, 0.005, 0.1
 """Errors below which a pose is right: of rotation, place, and in diameters."""
 HIDDEN: Final = 0.6
@@ -128,8 +129,10 @@ def on_table(name: str, names: tuple[str, ...], scenes: range) -> list[Trial]:
             continue
         masked = replace(shown.frame, mask=shown.mask)
         if (seen := prepare(masked, Segmented(), sought.tracker.segmenter, sensor).view) is not None:
+            last = _away(truth, sought, rng)
             found += _beside(where, (sought, thing), seen, truth, shown.visible)
-            found += _beside(where, (sought, thing), seen, truth, shown.visible, last=_away(truth, sought, rng))
+            found += _beside(where, (sought, thing), seen, truth, shown.visible, last=last)
+            found.append(_from_last(where, sought, masked, truth, shown.visible, last))
     return found
 
 
@@ -234,6 +237,7 @@ def in_capture(path: Path, part: Part, other: Path, out: Path, count: int) -> li
             if truth is not None:
                 last = _away(truth, sought, rng)
                 found += _beside(where, (sought, cloud), view, truth, visible, last=last)
+                found.append(_from_last(where, sought, seen.frame(index), truth, visible, last))
     return found
 
 
@@ -254,13 +258,24 @@ def _away(truth: Array, sought: Sought, rng: np.random.Generator) -> Array:
     return truth @ about @ moved @ se3.inverse(about)
 
 
-def _trial(where: tuple[str, str], sought: Sought, frame: Frame, truth: Array | None, visible: float) -> Trial:
+def _from_last(
+    where: tuple[str, str], sought: Sought, frame: Frame, truth: Array | None, visible: float, last: Array
+) -> Trial:
+    """Return what the tracker makes of a frame if it knows the pose before, `last`."""
+    tracker = replace(sought.tracker, independent=False)
+    tracker.newest.append(Tracked(-1, frame.time_s - 1.0, "found", PoseGaussian(last, np.eye(6)), usable=True))
+    return _trial(where, replace(sought, tracker=tracker), frame, truth, visible, OURS_FROM_LAST)
+
+
+def _trial(
+    where: tuple[str, str], sought: Sought, frame: Frame, truth: Array | None, visible: float, method: str = OURS
+) -> Trial:
     """Return what the tracker makes of a frame."""
     began_s = time.process_time()
     found = sought.tracker.update(frame)
     seconds = time.process_time() - began_s
     pose = None if found.pose is None or found.outcome == "unsure" else found.pose.mean
-    return Trial(*where, OURS, visible, pose is not None, found.usable, *_errors(sought, pose, truth),
+    return Trial(*where, method, visible, pose is not None, found.usable, *_errors(sought, pose, truth),
                  _nees(found, truth), seconds)  # fmt: skip
 
 
