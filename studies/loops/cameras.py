@@ -211,7 +211,13 @@ def summary(runs: Sequence[Run]) -> str:
 
 
 def asked(
-    study: str, description: str | None, arguments: Sequence[str] | None, *, per_class: int, out: Path
+    study: str,
+    description: str | None,
+    arguments: Sequence[str] | None,
+    *,
+    per_class: int,
+    out: Path,
+    recorded: bool = False,
 ) -> argparse.Namespace:
     """Return the options of a study of turned shapes before cameras; without `--shapes`, those of its half.
 
@@ -221,6 +227,7 @@ def asked(
         arguments: of the command line; None: those of the process.
         per_class: shapes of each class of symmetry, unless the user says how many.
         out: file of the results likewise.
+        recorded: whether the results have a table of it, which `--record` makes.
     """
     parser = argparse.ArgumentParser(prog=f"python -m studies {study}", description=description)
     parser.add_argument("--half", choices=("tuning", "held-out"), default="tuning", help="which shapes")
@@ -233,6 +240,8 @@ def asked(
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--step-deg", type=float, default=24.0, help="mean turn from frame to frame")
     parser.add_argument("--out", type=Path, default=out, help="file of the results")
+    if recorded:
+        parser.add_argument("--record", action="store_true", help="put the means into the results")
     options = parser.parse_args(arguments)
     options.shapes = options.shapes or [one.recipe for one in chosen(options.half, options.per_class)]
     return options

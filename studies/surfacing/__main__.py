@@ -72,6 +72,10 @@ _PLANE: Final = 0.1
 """Least share of the true surface that a plane has whose flatness is measured."""
 _NEAR_M: Final = 0.005
 """Distance from a plane within which surface belongs to it."""
+_FACING: Final = float(np.cos(np.radians(25.0)))
+"""Cosine between normals, likewise."""
+_NOISE: Final = "noise over the root of the views"
+"""Row of what the flatness of planes would be without smoothing, by the measurements."""
 _RECIPES = Path(sequences.__file__).parent / "recipes"
 
 
@@ -148,6 +152,8 @@ def _rows(name: str, folder: Path) -> list[dict[str, object]]:
                     "mb_a_frame": megabytes / len(run.views),
                 }
             )
+        noise_mm = 1e3 * _noise_m(run.views, trajectory, planes)
+        rows.append({"shape": name, "poses": poses, "method": _NOISE, "flatness_mm": noise_mm})
     return rows
 
 
@@ -185,28 +191,48 @@ def _flatness_m(made: Surface, planes: Array) -> float:
     away = []
     for *normal, offset_m in planes:
         off_m = points_m @ normal - offset_m
-        off_m = off_m[(np.abs(off_m) < _NEAR_M) & (normals @ normal > np.cos(np.radians(25.0)))]
+        off_m = off_m[(np.abs(off_m) < _NEAR_M) & (normals @ normal > _FACING)]
         away.append(np.abs(off_m - np.median(off_m)) if len(off_m) else off_m)
     away = np.concatenate(away) if away else np.zeros(0)
     return 1.4826 * float(np.median(away)) if len(away) else float("nan")
+
+
+def _noise_m(views: Mapping[int, RayImage], object_from_camera: Mapping[int, Array], planes: Array) -> float:
+    """Return how flat means over the views of a pixel would leave true planes: noise over the root of the views."""
+    sigmas_m = []
+    for *normal, offset_m in planes:
+        information = 0.0
+        for frame, view in views.items():
+            pose = object_from_camera[frame]
+            off_m = se3.transform(pose, view.points_m) @ normal - offset_m
+            off_m = off_m[(np.abs(off_m) < _NEAR_M) & (view.normals @ pose[:3, :3].T @ normal > _FACING)]
+            if len(off_m) >= _PLANE * len(view.points_m):
+                information += 1.0 / (1.4826 * np.median(np.abs(off_m - np.median(off_m)))) ** 2
+        if information:
+            sigmas_m.append(information**-0.5)
+    return float(np.mean(sigmas_m)) if sigmas_m else float("nan")
 
 
 def _table(rows: Sequence[Mapping[str, object]]) -> list[list[str]]:
     """Return medians over shapes by poses and method, each with the number of shapes on which ours is as good."""
     table = []
     for poses in ("true", "own"):
-        for method in METHODS:
+        for method in (*METHODS, _NOISE):
             cells = [f"{poses} poses: {method}"]
             for name, figure in FIGURES.items():
                 us, them = (
                     np.array(
-                        [row[name] for row in rows if (row["poses"], row["method"]) == (poses, which)], dtype=float
+                        [row.get(name, np.nan) for row in rows if (row["poses"], row["method"]) == (poses, which)],
+                        dtype=float,
                     )
                     for which in ("ours", method)
                 )
                 known = np.isfinite(us) & np.isfinite(them)
                 behind = (them - us if figure.more else us - them)[known] > _SMALL_MM * (not figure.more)
                 count = "" if method == "ours" else f" ({np.sum(~behind)} of {np.sum(known)})"
+                if not known.any():
+                    cells.append("")
+                    continue
                 cells.append(f"{np.median(them[known]):.{figure.decimals}f}{count}")
             table.append(cells)
     return table

@@ -4,7 +4,7 @@ Shapes pushed about a table for a full turn are filmed by modelled depth cameras
 given focal length has an error of 2 % standard deviation, and built with default settings. Meshes are laid on the true
 surface by a rigid motion. For each run: mean squared error of vertices over their variance, its median relative to that
 of a normal variable, the share of vertices within 1.96 standard deviations, and root mean squares of error and stated
-standard deviation. Runs of status 3, whose poses may be wrong, count apart. As an error of the focal length moves all
+standard deviation, of all runs and of those that end with status 0. As an error of the focal length moves all
 vertices of a run at once, the mean of a few runs says little.
 """
 
@@ -27,8 +27,10 @@ from modeler.export import write_atomically
 from modeler.sequences.meshes import Mesh
 from modeler.types import Array
 from studies.loops.cameras import asked, filmed_by
+from studies.results.tables import FOLDER, markdown, record
 from studies.trust.study import built
 
+TITLES: Final = ("", "shapes", "NEES, mean (range)", "median", "within 1.96 sd", "error, stated (mm)")
 _NORMAL_MEDIAN: Final = 0.4549  # of the square of a normal variable
 _PLACES: Final = 4000  # vertices by which a mesh is laid on the truth
 _ROUNDS: Final = 15
@@ -91,26 +93,36 @@ def errors_m(vertices_m: Array, truth: Mesh, model_from_object: Array) -> Array:
     return scene.compute_distance(tensor(laid_m.astype(np.float32)), nthreads=1).numpy().astype(np.float64)
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Return means over the shapes of each camera as a Markdown table; of the normalised error also its range."""
-    lines = ["| | shapes | NEES, mean (range) | median | within 1.96 sd | error, stated |", "|---" * 6 + "|"]
-    for name, trusted in dict.fromkeys((one.camera, one.trusted) for one in rows):
-        some = [one for one in rows if (one.camera, one.trusted) == (name, trusted)]
-        nees, median, covered, error_mm, stated_mm = np.mean(
-            [[one.nees, one.median, one.covered, one.error_mm, one.stated_mm] for one in some], axis=0
-        )
-        least, most = min(one.nees for one in some), max(one.nees for one in some)
-        lines.append(
-            f"| {name}, status {0 if trusted else 3} | {len(some)} "
-            f"| {nees:.2f} ({least:.1f} to {most:.1f}) | {median:.2f} | {covered:.0%} | "
-            f"{error_mm:.2f}, {stated_mm:.2f} mm |"
-        )
-    return "\n".join(lines)
+def table(rows: Sequence[Row]) -> list[list[str]]:
+    """Return means over the shapes of each camera, of all and of those that end with 0; of the NEES also its range."""
+    lines = []
+    for name in dict.fromkeys(one.camera for one in rows):
+        own = [one for one in rows if one.camera == name]
+        for which, some in (("all", own), ("status 0", [one for one in own if one.trusted])):
+            if not some:
+                continue
+            nees, median, covered, error_mm, stated_mm = np.mean(
+                [[one.nees, one.median, one.covered, one.error_mm, one.stated_mm] for one in some], axis=0
+            )
+            least, most = min(one.nees for one in some), max(one.nees for one in some)
+            lines.append(
+                [
+                    f"{name}, {which}",
+                    str(len(some)),
+                    f"{nees:.2f} ({least:.1f} to {most:.1f})",
+                    f"{median:.2f}",
+                    f"{covered:.0%}".replace("%", " %"),
+                    f"{error_mm:.2f}, {stated_mm:.2f}",
+                ]
+            )
+    return lines
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
-    options = asked("surfacing.vertices", __doc__, arguments, per_class=1, out=Path("runs/vertices.json"))
+    options = asked(
+        "surfacing.vertices", __doc__, arguments, per_class=1, out=Path("runs/vertices.json"), recorded=True
+    )
     rows = []
     for name in options.cameras:
         for shape in options.shapes:
@@ -118,7 +130,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(rows[-1], file=sys.stderr, flush=True)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(options.out, json.dumps([vars(one) for one in rows], indent=1) + "\n")
-    print(table(rows))
+    made = table(rows)
+    print(markdown(TITLES, made))
+    if options.record:
+        record(FOLDER / "vertices.json", made)
     return 0
 
 
