@@ -15,6 +15,7 @@ from modeler.types import Array, BoolArray, Camera, Float32Array
 
 MOST = 0.5  # the majority of pixels, frames or a rim
 MOSTLY = 0.7  # of the measurements at a static pixel agree; of the frames show the object alone
+CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
 LEAST_PIECE = 0.07  # of the largest: noise along edges, and false depth around limbs, have pieces of up to 6 %
 STRAY_WEIGHT = 0.2  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
 HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an image that shows an object alone
@@ -271,6 +272,15 @@ def edge_of(seen: BoolArray) -> BoolArray:
     measurements is different: an object that crosses it is not truncated.
     """
     return _outermost(seen) | _outermost(seen.T).T
+
+
+def is_cut(mask: BoolArray, edge: BoolArray | None) -> bool:
+    """Return whether a mask (h, w) extends beyond the field of view with such an edge, which may be downsampled."""
+    if edge is None:
+        return False
+    stride = round(len(mask) / len(edge))
+    thin = mask[::stride, ::stride]
+    return bool(np.count_nonzero(thin & edge) >= CUT_SHARE * np.sqrt(np.count_nonzero(thin)))
 
 
 def _outermost(seen: BoolArray) -> BoolArray:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.segmentation.depth_images import (
+    CUT_SHARE,
     LEAST_PIECE,
     STRAY_WEIGHT,
     DepthNoise,
@@ -33,7 +34,6 @@ _MOVED = 0.028  # of an object's outline between the frames from which its scene
 _GAP_FLOORS = 15.0  # least gap in noise floors, 12 mm: nearby, the parts of a plush toy are as far apart
 _CREASE = 0.014  # creases of the support are at most so high, and so far from the object, as a share of its distance
 _LOW_SHARE = 0.3  # share of the object's height, for flat objects
-_CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
 AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
 
 
@@ -187,7 +187,7 @@ def _mostly(chosen: BoolArray, labels: Labels) -> BoolArray:
 
 def _many(ends: BoolArray, labels: Labels) -> BoolArray:
     """Return which labels (k,) so many of whose pixels (n,) are at an end that they continue there."""
-    return np.bincount(labels, ends) > _CUT_SHARE * np.sqrt(np.bincount(labels))
+    return np.bincount(labels, ends) > CUT_SHARE * np.sqrt(np.bincount(labels))
 
 
 def _arm(part: _Part, scene: Scene, zone_m: Array) -> BoolArray:
@@ -379,15 +379,6 @@ def _not_a_crease(height_m: Float32Array, fore: BoolArray, highest_m: float, rea
     high = (fore & (height_m > low)).astype(np.uint8)
     near: BoolArray = ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
     return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)  # a crease surrounds the object
-
-
-def is_cut(mask: BoolArray, edge: BoolArray | None) -> bool:
-    """Return whether a mask (h, w) extends beyond the field of view with such an edge, which may be downsampled."""
-    if edge is None:
-        return False
-    stride = round(len(mask) / len(edge))
-    thin = mask[::stride, ::stride]
-    return bool(np.count_nonzero(thin & edge) >= _CUT_SHARE * np.sqrt(np.count_nonzero(thin)))
 
 
 def nearest_seen_m(frames: Sequence[Frame], masks: Sequence[BoolArray]) -> Float32Array:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from modeler.segmentation.arms import Arms
 from modeler.segmentation.background_colour import BackgroundColour
 from modeler.segmentation.depth_images import (
     HARDLY,
@@ -69,6 +70,8 @@ class Scene:
     """Whether arms that touch the object are in most frames."""
     leads_out: bool = False
     """Whether the object leads out of view in most frames: the image cuts it off, or an arm is taken for part of it."""
+    held: Arms | None = None
+    """What holds the object and leads out of view in most frames."""
     areas_m2: tuple[float, float] | None = None
     """Least and greatest area that the object showed to the camera."""
     sure: bool = True

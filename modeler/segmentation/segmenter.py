@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import ndimage
 
+from modeler.segmentation.arms import Arms
 from modeler.segmentation.background_colour import BackgroundColour, without_background
 from modeler.segmentation.depth_images import (
     MOST,
@@ -15,13 +16,14 @@ from modeler.segmentation.depth_images import (
     at_rim,
     change_at_rim,
     edge_of,
+    is_cut,
     noise_over_frames,
     noise_within,
     planning_stride,
     point_image,
     separate_layers,
 )
-from modeler.segmentation.finding import AREA_FACTOR, Found, find, is_cut, nearest_seen_m
+from modeler.segmentation.finding import AREA_FACTOR, Found, find, nearest_seen_m
 from modeler.segmentation.planes import choose_support, dominant_planes, fit_beside, surroundings
 from modeler.segmentation.scene import RIVAL, Scene, clean, is_island, learn, shows_object_alone
 from modeler.types import BoolArray, Float32Array, Frame, InputError, Outcome, Plane, Segmentation, checked
@@ -106,10 +108,14 @@ class Segmenter:
         zone = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
         sure = scene.sure and float(np.median(rivals)) < RIVAL
         frames, masks = [frame for frame, _ in looks], [look.mask for _, look in looks]
+        held = None
+        if not whole and scene.plane is None and scene.edge is not None:
+            held = Arms.learned(frames, masks, scene.edge, scene.noise or self.noise, self.min_points)
         return replace(
             scene,
             nearest_m=nearest_seen_m(frames, masks) if whole else None,
-            leads_out=not whole,
+            leads_out=not whole and held is None,
+            held=held,
             zone_m=zone,
             areas_m2=(min(areas), max(areas)),
             sure=sure,
@@ -149,7 +155,8 @@ class Segmenter:
         if not (scene.still and self._holds(frame, scene)):
             scene = self._learn([frame])
         found = self._find(frame, scene)
-        mask = without_background(found.mask, frame, scene.background)
+        mask = found.mask if scene.held is None else scene.held.without(frame, found.mask)
+        mask = without_background(mask, frame, scene.background)
         count = np.count_nonzero(mask)
         if count < self.min_points:
             return Segmentation(mask, scene.plane, Outcome.TOO_FEW_POINTS)
