@@ -179,8 +179,8 @@ def magnification(edges: Sequence[Edge], distance_m: float) -> float:
     loop closure makes smaller also look smaller.
     """
     blocks = [e.posterior.pose.covariance[3:, 3:] for e in edges if e.accepted and e.kind == "odometry"]
-    variances = [float(np.linalg.eigvalsh(block)[-1]) for block in blocks if np.isfinite(block).all()]
-    variances = [variance for variance in variances if variance > 0.0]
+    finite = np.array([block for block in blocks if np.isfinite(block).all()]).reshape(-1, 3, 3)
+    variances = [variance for variance in np.linalg.eigvalsh(finite)[:, -1].tolist() if variance > 0.0]
     if not variances:
         return 1.0
     sigma_m = math.sqrt(max(9.0 * variances[0], sum(variances)))  # room for nine edges from the start

@@ -28,7 +28,7 @@ from modeler.viz.drawings import (
     shaded,
     shown_posterior,
 )
-from modeler.viz.readings import worst_axis_sd
+from modeler.viz.readings import worst_axis_sds
 
 _DRAWS: Final = 80  # samples, of which each is still seen by itself
 _PATHS: Final = (
@@ -160,7 +160,7 @@ def _factor(modes: Sequence[Mode], view: RayImage) -> float:
     widest_rad, widest_m = 0.0, 0.0
     for mode in modes:
         covariance = se3.covariance_about(mode.pose.covariance, view.centroid_m)
-        turn_rad, shift_m = (worst_axis_sd(block) for block in (covariance[:3, :3], covariance[3:, 3:]))
+        turn_rad, shift_m = worst_axis_sds(covariance)
         widest_rad, widest_m = max(widest_rad, turn_rad), max(widest_m, math.hypot(radius_m * turn_rad, shift_m))
     if not widest_m > 0.0:
         return 1.0

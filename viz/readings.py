@@ -35,7 +35,8 @@ def sd_of(pose: PoseGaussian, centre_m: Array) -> Sd:
     if not np.isfinite(pose.covariance).all():
         return Sd(math.nan, math.nan)
     covariance = se3.covariance_about(pose.covariance, centre_m)
-    return Sd(math.degrees(worst_axis_sd(covariance[:3, :3])), 1000.0 * worst_axis_sd(covariance[3:, 3:]))
+    turn_rad, shift_m = worst_axis_sds(covariance)
+    return Sd(math.degrees(turn_rad), 1000.0 * shift_m)
 
 
 def certainty_words(posterior: Posterior, centre_m: Array) -> list[str]:
@@ -62,9 +63,10 @@ def _short(value: float) -> str:
     return "<0.01" if 0.0 < value < 0.01 else f"{value:.2g}"
 
 
-def worst_axis_sd(covariance: Array) -> float:
-    """Return the sd along the least certain axis of a covariance (3, 3)."""
-    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+def worst_axis_sds(covariance: Array) -> tuple[float, float]:
+    """Return the sd of rotation and translation, each along its least certain axis, of a covariance (6, 6) of ξ."""
+    turn, shift = np.linalg.eigvalsh(np.array([covariance[:3, :3], covariance[3:, 3:]]))[:, -1].tolist()
+    return math.sqrt(max(turn, 0.0)), math.sqrt(max(shift, 0.0))
 
 
 _SERIES_RGB = {"odometry": entities.ODOMETRY_RGB, "closure": entities.CLOSURE_RGB, "pose": entities.UNCERTAINTY_RGB}

@@ -218,7 +218,8 @@ def _json(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _json(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
-        return _json(value.ravel().tolist())
+        plain = value.ravel().tolist()
+        return plain if np.isfinite(value).all() else _json(plain)
     if isinstance(value, list | tuple):
         return [_json(entry) for entry in value]
     if isinstance(value, np.generic):

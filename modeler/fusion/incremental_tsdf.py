@@ -101,8 +101,7 @@ class IncrementalTsdf:
         weights[weights < KNOWN] = 0.0
         for axis in range(3):
             np.moveaxis(weights, axis, 0)[[0, -1]] = 0.0
-        known = weights > 0.0
-        values = np.where(known, self.sums[..., 1] / np.where(known, weights, 1.0), 0.0).astype(np.float32)
+        values = np.divide(self.sums[..., 1], weights, out=np.zeros_like(weights), where=weights > 0.0)
         positions, triangles = marching_cubes.extract(values, weights, crossed(values))
         shown = triangles[meshing.large_pieces(positions, triangles)]
         used, shown = meshing.used_vertices(shown, len(positions))

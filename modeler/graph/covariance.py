@@ -127,12 +127,12 @@ class RelativeCovariance:
         if target == source:
             return covariance
         right = {source: np.eye(6), target: -se3.adjoint(source_from_target).T}  # columns still to be solved for
-        rank = self._ranks.__getitem__
+        rank, leaves, conditional = self._ranks.__getitem__, self.leaves, self.eliminated.conditional
         while right:  # method, eq. 8.6
             variable = min(right, key=rank)
-            root, others, parents = self.leaves.get(variable) or self.eliminated.conditional(variable)
+            root, others, parents = leaves.get(variable) or conditional(variable)
             solved = _trsm(1.0, root, right.pop(variable), trans_a=1)
-            covariance = covariance + solved.T @ solved
+            covariance += solved.T @ solved
             updates = (others.T @ solved).reshape(-1, 6, 6)
             for parent, update in zip(parents, updates, strict=True):
                 right[parent] = right[parent] - update if parent in right else -update
@@ -173,13 +173,14 @@ class PoseCovariances(Mapping[int, Array]):
     """object_from_camera (4, 4) by frame number."""
     one: Callable[[int], Array]
     """Computes the covariance of one frame."""
-    _computed: dict[int, Array] = field(default_factory=dict, init=False, repr=False)
+    known: dict[int, Array] = field(default_factory=dict, repr=False)
+    """By frame number, those computed so far."""
 
     def __getitem__(self, frame: int) -> Array:
         """Return the covariance of one pose."""
-        if frame not in self._computed:
-            self._computed[frame] = self.one(frame)
-        return self._computed[frame]
+        if frame not in self.known:
+            self.known[frame] = self.one(frame)
+        return self.known[frame]
 
     def __contains__(self, frame: object) -> bool:
         """Return whether a frame was solved."""

@@ -148,7 +148,9 @@ class Smoother:
         state = replace(state, covariance=None if self.axis is not None else independent)
         return state, Solution(
             trajectory=trajectory,
-            covariances=PoseCovariances(trajectory, functools.partial(relative_covariance, root)),
+            covariances=PoseCovariances(
+                trajectory, functools.partial(relative_covariance, root), self._known(relative_covariance)
+            ),
             outliers=tuple(loop.edge for loop, good in zip(loops, inlier, strict=True) if not good),
             relative_covariance=relative_covariance,
             deforming_covariance=relative_covariance.deforming,
@@ -159,6 +161,15 @@ class Smoother:
             variance_factor=self.variance_factor,
             camera_from_axis=None if with_axis is None else with_axis.camera_from_axis,
         )
+
+    def _known(self, relative: RelativeCovariance | SharedCovariance) -> dict[int, Array]:
+        """Return covariances of poses which frames that have been added, each by one factor, leave as they are."""
+        before, poses = self.solution.relative_covariance, self.solution.covariances
+        if not (isinstance(before, RelativeCovariance) and isinstance(relative, RelativeCovariance)):
+            return {}
+        if not (isinstance(poses, PoseCovariances) and before.eliminated is relative.eliminated):
+            return {}
+        return dict(poses.known)
 
     def _factors(self, graph: PoseGraph) -> dict[Edge, Factor]:
         """Return every accepted edge of a graph as one Gaussian, reusing factors of the solved graph."""
