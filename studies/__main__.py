@@ -18,6 +18,7 @@ STUDIES: dict[str, tuple[str, str]] = {
     "active.picture": ("draw a robot that follows the suggestions", "a minute"),
     "active.pokes": ("spin between two views after pokes, predicted and realised", "minutes"),
     "bench": ("speed against Open3D and the committed baseline", "minutes"),
+    "bench.following": ("time in which objects are found and followed with their models", "a minute"),
     "bench.gpu": ("speed on an NVIDIA GPU against two CPU threads of the same machine", "minutes"),
     "bench.multiway": ("make a whole model by Open3D's recipes", "seconds"),
     "bench.stages": ("processor seconds of a build by stage", "seconds"),

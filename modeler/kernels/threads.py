@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 _BLOCKS = 4  # for each thread: in two, pairs took 0.88 of the time with halves on busy cores; a call takes 15 µs
+_WORTH_S = 4e-4  # that one thread takes, from which others help: to wake one and to join its results takes 0.2 ms
 _pools: dict[int, ThreadPoolExecutor] = {}
 os.register_at_fork(after_in_child=_pools.clear)  # a child process has none of its parent's threads
 
@@ -21,7 +22,7 @@ def over_rows(
 ) -> Any:
     """Return a kernel's result for `rows`, one array or several, computed in blocks of rows and concatenated.
 
-    Threads take blocks until none is left, this one from the first on, others from the last. While other programs keep
+    Threads take blocks until none is left, this one from the first on, others, if it is worth it, from the last. While other programs keep
     the cores busy, a thread may be stopped for milliseconds: what others have not begun this one does, and what they
     do not end soon it does once more.
 
@@ -37,8 +38,12 @@ def over_rows(
         return kernel(rows, *arguments)
     if threads not in _pools:
         _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="kernel")
-    blocks = np.array_split(rows, min(_BLOCKS * threads, len(rows) // least))
-    left, parts, took_s = deque(range(len(blocks))), dict[int, Any](), 0.0
+    count = min(_BLOCKS * threads, len(rows) // least)
+    first, began_s = max(len(rows) // (2 * count), 1), time.perf_counter()
+    parts = {0: kernel(rows[:first], *arguments)}
+    took_s = time.perf_counter() - began_s
+    blocks = [rows[:first], *np.array_split(rows[first:], count if 2 * count * took_s > _WORTH_S else 1)]
+    left = deque(range(1, len(blocks)))
 
     def help_out() -> None:
         with contextlib.suppress(IndexError):  # none is left
@@ -46,7 +51,7 @@ def over_rows(
                 number = left.pop()
                 parts[number] = kernel(blocks[number], *arguments)
 
-    helpers = [_pools[threads].submit(help_out) for _ in range(threads - 1)]
+    helpers = [_pools[threads].submit(help_out) for _ in range(min(threads, len(left)) - 1)]
     with contextlib.suppress(IndexError):
         while True:
             number, began_s = left.popleft(), time.perf_counter()

@@ -61,17 +61,14 @@ def shape(name: str) -> Mesh:
 @cache
 def model_of(name: str) -> ObjectModel:
     """Return the true model of a shape."""
-    mesh = trimesh.Trimesh(shape(name).vertices_m, shape(name).triangles, process=True)
-    empty = np.zeros((0, 3))
-    return ObjectModel(
-        points_m=empty,
-        normals=empty,
-        colours=None,
-        vertices_m=np.asarray(mesh.vertices, np.float64),
-        triangles=np.asarray(mesh.faces, np.int64),
-        vertex_normals=np.asarray(mesh.vertex_normals, np.float64),
-        vertex_colours=None,
-    )
+    return exact_model(shape(name).vertices_m, shape(name).triangles)
+
+
+def exact_model(vertices_m: Array, triangles: np.ndarray) -> ObjectModel:
+    """Return a mesh as a model without errors."""
+    mesh, empty = trimesh.Trimesh(vertices_m, triangles, process=True), np.zeros((0, 3))
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    return ObjectModel(empty, empty, None, vertices, faces, np.asarray(mesh.vertex_normals, np.float64), None)
 
 
 def noise(distance_m: float, view: Viewpoint) -> SensorNoise:

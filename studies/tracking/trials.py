@@ -27,7 +27,7 @@ from modeler.views import Sensor
 from studies.calibration.specimens import SPECIMENS, Half, load_specimen
 from studies.calibration.study import Condition, staged
 from studies.tracking.baselines import ModelCloud, methods
-from studies.tracking.clutter import VIEWS, model_of, mssd_m, noise, scene
+from studies.tracking.clutter import VIEWS, exact_model, model_of, mssd_m, noise, scene
 
 OURS: Final = "modeler track"
 OURS_FROM_LAST: Final = f"{OURS} from the last pose"
@@ -151,7 +151,7 @@ def turned(name: str, out: Path) -> list[Trial]:
     first, thing = min(poses_of(RunFolder(run).result())), known_object(run)
     sensor, scale = Sensor(sequence.sensor()), 0.0 if thing.focal is None else thing.focal.depth_scale_sigma
     sought = Sought(thing.model, Tracker(thing.model, sensor, independent=True, depth_scale_sigma=scale))
-    exact = ModelCloud(_exact(mesh.vertices_m, mesh.triangles), sought.diameter_m)
+    exact = ModelCloud(exact_model(mesh.vertices_m, mesh.triangles), sought.diameter_m)
     fit = IcpRegistrar().refine(sought.thing.cloud, exact.cloud, se3.inverse(truth[first]))
     if fit is None:
         return []
@@ -167,7 +167,7 @@ def followed(name: str) -> list[Trial]:
     """Return trials of a shape that is followed as it turns, each method from its own last pose; all start right."""
     sequence = RenderedSequence(staged(load_specimen(name), Condition(step_deg=_STEP_DEG), frames=_FOLLOWED, seed=1))
     mesh, truth = sequence.model(), sequence.truth()
-    model = _exact(mesh.vertices_m, mesh.triangles)
+    model = exact_model(mesh.vertices_m, mesh.triangles)
     sensor = Sensor(sequence.sensor())
     sought = Sought(model, Tracker(model, sensor))
     thing, found = sought.thing, list[Trial]()
@@ -239,15 +239,6 @@ def in_capture(path: Path, part: Part, other: Path, out: Path, count: int) -> li
                 found += _beside(where, (sought, cloud), view, truth, visible, last=last)
                 found.append(_from_last(where, sought, seen.frame(index), truth, visible, last))
     return found
-
-
-def _exact(vertices_m: Array, triangles: np.ndarray) -> ObjectModel:
-    """Return a mesh as a model without errors."""
-    import trimesh
-
-    mesh, empty = trimesh.Trimesh(vertices_m, triangles, process=True), np.zeros((0, 3))
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    return ObjectModel(empty, empty, None, vertices, faces, np.asarray(mesh.vertex_normals, np.float64), None)
 
 
 def _away(truth: Array, sought: Sought, rng: np.random.Generator) -> Array:
