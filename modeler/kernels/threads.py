@@ -22,9 +22,9 @@ def over_rows(
 ) -> Any:
     """Return a kernel's result for `rows`, one array or several, computed in blocks of rows and concatenated.
 
-    Threads take blocks until none is left, this one from the first on, others, if it is worth it, from the last. While other programs keep
-    the cores busy, a thread may be stopped for milliseconds: what others have not begun this one does, and what they
-    do not end soon it does once more.
+    Threads take blocks until none is left, this one from the first on, others, if it is worth it, from the last. While
+    other programs keep the cores busy, a thread may be stopped for milliseconds: what others have not begun this one
+    does, and what they do not end soon it does once more.
 
     Args:
         kernel: releases the GIL (`nogil=True`); takes rows and the arguments, each row independently.
