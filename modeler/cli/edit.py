@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from modeler.cli.console import say, trusted_status
 from modeler.composition.options import SEED, default
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,12 @@ _TURN_RAD: Final = 0.15  # sd of an arm's turn between two frames; by hand: obje
 _SHIFT: Final = 0.5  # likewise of its shift, as a share of the mask's size
 _AGREES: Final = 0.7  # share of the frames that see it from which surface moves with the arm; 0.5: stops lose objects
 _STEADY: Final = 0.75  # of the surface next to the edge that has to agree: that of an object which turns does not
-_FRAMES: Final = 8  # with which one is compared
-_POINTS: Final = 400  # that are aligned
+_FRAMES: Final = 8  # with which one is compared: of 15, for half of the time
+_POINTS: Final = 400  # that are aligned, likewise for time
 _EFFECTIVE: Final = 200.0  # of them, neighbours being alike: against the priors of turn and shift
-_GROWTHS, _SETTLED = 5, 0.99
-_COARSEST, _FINER = 8.0, 0.7  # tolerances at first, and their ratio from step to step
-_STEPS: Final = 12
+_GROWTHS, _SETTLED = 5, 0.99  # at most, and the share of a mask from which nothing grows any more; by hand
+_COARSEST, _FINER = 8.0, 0.7  # tolerances at first, and their ratio from step to step; by hand
+_STEPS: Final = 12  # six until the tolerance is the noise's, by this ratio, and as many at it
 
 Pixels = npt.NDArray[np.int64]
 

@@ -123,13 +123,8 @@ def _predicted(belief: Belief, candidates: Sequence[Candidate]) -> list[Predicti
 def _default(belief: Belief) -> list[Prediction]:
     """Return predictions of actions of a person at a table; turns near the best ones are sampled more finely."""
     table = turntable_in(belief.prior)
-    others = _predicted(
-        belief,
-        [
-            *pokes(belief.last, belief.stand, belief.object_from_last),
-            Candidate("lay", cost=8.0),
-        ],  # a turn in eight steps
-    )
+    lying = Candidate("lay", cost=8.0)  # a separate run: a full turn in steps of 45° at least
+    others = _predicted(belief, [*pokes(belief.last, belief.stand, belief.object_from_last), lying])
     if table is not None:
         return others + _predicted(belief, turns(abs(table.step_deg)))
     found = _predicted(belief, turns(_COARSE_DEG))
