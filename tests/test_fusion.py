@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 
 from modeler import se3
-from modeler.fusion import Fuser, IncrementalTsdf, meshing
+from modeler.fusion import Fuser, meshing
 from modeler.sequences.bop import BopSequence
 from modeler.types import (
     Frame,
@@ -273,23 +273,41 @@ def test_a_handful_of_pixels_is_no_reason_to_fail():
     model = FUSER.fuse({0: few}, {0: np.eye(4)})
     assert model.triangles.shape == (len(model.triangles), 3)
     assert np.isfinite(model.vertices_m).all()
-    assert np.isfinite(IncrementalTsdf(FUSER).updated({0: few}, {0: np.eye(4)}).model().points_m).all()
+    preview = FUSER.preview({0: few}, {0: np.eye(4)})
+    assert preview is not None
+    assert np.isfinite(preview.points_m).all()
+
+
+def test_the_preview_is_the_surface_at_every_step():
+    views, trajectory = tabletop.views(BALL, POSES), tabletop.trajectory(POSES)
+    assert FUSER.preview({}, trajectory) is None
+    points = 0
+    for count in (1, 3, len(views)):
+        some = dict(list(views.items())[:count])
+        model = FUSER.preview(some, trajectory)
+        assert model is not None
+        assert len(model.points_m) > points
+        points = len(model.points_m)
+        np.testing.assert_array_equal(model.points_m, model.vertices_m)
+        voxel_m = 2.5 * FUSER.voxel_side_m([(view, trajectory[frame]) for frame, view in some.items()])
+        assert np.quantile(np.abs(BALL.distance(model.points_m)), 0.95) < voxel_m
+        assert np.mean(np.sum(model.normals * model.points_m, axis=1) > 0.0) > 0.98  # outwards
 
 
 def test_input_that_cannot_be_fused_is_refused():
     views, trajectory = tabletop.views(BALL, POSES[:2]), tabletop.trajectory(POSES[:2])
-    for method in (FUSER.fuse, IncrementalTsdf(FUSER).updated):
+    for method in (FUSER.fuse, FUSER.preview):
         with pytest.raises(InputError, match="nothing to fuse"):
             method(views, {})
-        with pytest.raises(InputError, match="nothing to fuse"):
-            method({}, trajectory)
+    with pytest.raises(InputError, match="nothing to fuse"):
+        FUSER.fuse({}, trajectory)
 
 
 @pytest.mark.parametrize("voxel_m", [0.0, -1.0, 1e-300, 1e-9, 1e-6, np.inf, np.nan])
 def test_an_absurd_voxel_size_is_refused_before_anything_is_allocated(voxel_m):
     views, trajectory = tabletop.views(BALL, POSES[:2]), tabletop.trajectory(POSES[:2])
     fuser = Fuser(voxel_m=voxel_m)
-    for method in (fuser.fuse, IncrementalTsdf(fuser).updated):
+    for method in (fuser.fuse, fuser.preview):
         with pytest.raises(InputError, match=r"voxel size .* at least [\d.e-]+ m"):
             method(views, trajectory)
 
@@ -297,12 +315,10 @@ def test_an_absurd_voxel_size_is_refused_before_anything_is_allocated(voxel_m):
 @pytest.mark.parametrize("voxel_m", [5e-5, 1.0])
 def test_extreme_voxel_sizes_stay_within_the_memory_bound(voxel_m):
     views, trajectory = tabletop.views(BALL, POSES[:2]), tabletop.trajectory(POSES[:2])
-    fuser = Fuser(voxel_m=voxel_m, max_voxels=64**3, preview_limit=64**3)
+    fuser = Fuser(voxel_m=voxel_m, max_voxels=64**3)
     assert np.prod(fuser.volume(views, trajectory).grid.shape) < 1.5 * 64**3
     fuser.fuse(views, trajectory)
-    preview = IncrementalTsdf(fuser).updated(views, trajectory)
-    assert preview.sums[..., 0].size <= 64**3
-    preview.model()
+    fuser.preview(views, trajectory)
 
 
 def test_the_voxels_follow_the_pixels_and_stay_within_their_number(ball):
@@ -438,7 +454,8 @@ def test_a_view_without_colour_leaves_the_colours_to_others(brick):
     views = tabletop.views(BRICK, POSES)
     views[4] = replace(views[4], frame=replace(views[4].frame, colour=None))
     trajectory = tabletop.trajectory(POSES)
-    for model in (FUSER.fuse(views, trajectory), IncrementalTsdf(FUSER).updated(views, trajectory).model()):
+    for model in (FUSER.fuse(views, trajectory), FUSER.preview(views, trajectory)):
+        assert model is not None
         assert model.colours is not None
         top = (np.abs(model.points_m[:, :2]) < [0.05, 0.03]).all(axis=1) & (model.points_m[:, 2] > 0.03)
         assert np.abs(model.colours[top].astype(int) - [128, 128, 228]).max() <= 2

@@ -4,16 +4,13 @@ from modeler.fusion.alignment import Match, Matcher
 from modeler.fusion.deformation import widened
 from modeler.fusion.depth_views import conditional_covariances
 from modeler.fusion.fuser import Fuser, FusionVolume
-from modeler.fusion.incremental_tsdf import IncrementalTsdf, Preview
 from modeler.fusion.symmetries import Symmetries, SymmetryFinder
 
 __all__ = [
     "Fuser",
     "FusionVolume",
-    "IncrementalTsdf",
     "Match",
     "Matcher",
-    "Preview",
     "Symmetries",
     "SymmetryFinder",
     "conditional_covariances",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from modeler import se3
 from modeler.fusion import meshing, watertight
 from modeler.fusion.depth_views import (
+    GREY,
     SMOOTHED,
     Cropping,
     DepthViews,
@@ -34,6 +36,7 @@ SOFT, SHARP = 4.0, 16.0
 CONFIRMED = 2  # views that see the same surface: thin parts that one view alone sees are errors along its outline
 HALVES = np.array([0.36, 0.48, 0.8])  # divides directions in two halves; chosen by hand, along no axis
 MIN_NEIGHBOURS = 6  # points of the cloud with fewer in 27 cells of two voxels are outliers; a plane has some 36
+PREVIEW_VIEWS, PREVIEW_POINTS = 100, 60_000  # at most: more take longer, and look the same
 FINEST_PX = 0.01  # smallest voxel, in pixel footprints: a hundred voxels per pixel resolve nothing
 
 
@@ -49,10 +52,6 @@ class Fuser:
     """Side of a voxel in m; None: the footprint of a pixel, or half the sensor's noise if that is larger."""
     max_voxels: int = 192**3
     """Memory bound: voxels are enlarged until the object's box holds at most this many."""
-    preview_limit: int = 128**3
-    """Memory bound of the preview, as `max_voxels`."""
-    preview_moves: int = 8
-    """The preview integrates at most this many moved views again per update."""
     min_cosine: float = 0.15
     """Surface points seen at a smaller cosine between normal and ray (81°) are not used."""
     edge_weight: float = 0.1
@@ -116,6 +115,32 @@ class Fuser:
         near_m = grid.voxel_m + 2.0 * spread_m
         multipath_m = float(np.median([view.multipath_m for view, _ in one_by_one(pairs)]))
         return FusionVolume(self, seen.carving(tau_m), grid, tau_m, near_m, sigma_m, _smoothing_m2(pairs), multipath_m)
+
+    def preview(self, views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ObjectModel | None:
+        """Return a coarse cloud for a run in progress, quickly, its points as vertices too, but without triangles.
+
+        Takes and raises the same as `fuse`; None without views.
+        """
+        if not views:
+            return None
+        pairs = [pair for pair in posed_views(views, trajectory) if len(pair[0].points_m)]
+        pairs = pairs[:: -math.ceil(len(pairs) / PREVIEW_VIEWS)]  # the newest among them
+        step = math.ceil(sum(len(view.points_m) for view, _ in pairs) / PREVIEW_POINTS)
+        clouds = [_posed_points(view, pose, step) for view, pose in one_by_one(pairs)]
+        points_m, attributes, weights = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
+        points_m, attributes = voxel_means(
+            [(points_m, attributes, weights)],
+            _extent_m(points_m)[None],
+            voxel_m=2.5 * self.voxel_side_m(pairs),  # as many points as the viewer shows of an object
+            max_voxels=self.max_voxels,
+        )
+        normals, share = attributes[:, :3], attributes[:, 6:]
+        colours = None
+        if share.any():
+            mean = np.where(share > 0.0, attributes[:, 3:6] / np.maximum(share, 1e-9), GREY)
+            colours = np.rint(mean).astype(np.uint8)
+        triangles = np.zeros((0, 3), dtype=np.int64)
+        return ObjectModel(points_m, normals, colours, points_m, triangles, normals, colours)
 
     def voxel_side_m(self, pairs: list[tuple[RayImage, Array]]) -> float:
         """Return the side of a voxel before the memory bound is applied.
@@ -306,7 +331,7 @@ class FusionVolume:
 def downsampled(
     points_m: Array, normals: Array, weights: Array, *, voxel_m: float, max_voxels: int
 ) -> tuple[Array, Array]:
-    """Average oriented points (n, 3) over voxels; see `voxel_means`."""
+    """Average points (n, 3) with normals (n, 3) over voxels; see `voxel_means`."""
     box_m = _extent_m(points_m)[None]
     return voxel_means([(points_m, normals, weights)], box_m, voxel_m=voxel_m, max_voxels=max_voxels)
 
@@ -317,40 +342,53 @@ def voxel_means(
     """Average the oriented points of several clouds over voxels, those on opposite sides of a sheet apart.
 
     Args:
-        clouds: points (n, 3), normals (n, 3) and weights (n,) of each.
+        clouds: of each, points (n, 3), attributes (n, 3 + k), of which the first three are the normal, and weights
+            (n,).
         boxes_m: (k, 2, 3) lowest and highest corners of boxes that hold them.
         voxel_m: side of a voxel.
         max_voxels: voxels are enlarged until the box of all boxes has at most this many.
 
     Returns:
-        Points (m, 3) and unit normals (m, 3), in the order in which the points enter the voxels.
+        Points (m, 3) and attributes (m, 3 + k) with unit normals, in the order in which the points enter the voxels.
     """
     low, high = boxes_m[:, 0].min(axis=0), boxes_m[:, 1].max(axis=0)
     while np.prod(np.ceil((high - low) / voxel_m) + 1.0) > max_voxels:
         voxel_m *= 1.25
     shape = (np.ceil((high - low) / voxel_m) + 1.0).astype(np.int64)
-    voxels, sums = np.zeros(0, dtype=np.int64), np.zeros((0, 7))
+    voxels, sums = np.zeros(0, dtype=np.int64), None
     halves = (side for cloud in clouds for side in _sides(*cloud))
-    for half, (points_m, normals, weights) in halves:
+    for half, (points_m, attributes, weights) in halves:
         cells, count = point_clouds.voxel_numbers(points_m, low, voxel_m, shape)
-        some, totals = point_clouds.voxel_sums(cells, count, weights, np.concatenate([points_m, normals], axis=1))
+        some, totals = point_clouds.voxel_sums(cells, count, weights, np.concatenate([points_m, attributes], axis=1))
         firsts = np.empty(count, dtype=np.int64)
         firsts[cells[::-1]] = np.arange(len(cells))[::-1]  # the last assignment counts
         places = np.floor((points_m[firsts] - low) / voxel_m).astype(np.int64)
         voxels = np.concatenate([voxels, 2 * np.ravel_multi_index(tuple(places.T), tuple(shape)) + half])
-        sums = np.concatenate([sums, np.concatenate([some, totals[:, None]], axis=1)])
-        voxels, sums = _summed(voxels, sums)
-    means = sums[:, :6] / sums[:, 6:]
-    lengths = np.linalg.norm(means[:, 3:], axis=1)
+        some = np.concatenate([some, totals[:, None]], axis=1)
+        voxels, sums = _summed(voxels, some if sums is None else np.concatenate([sums, some]))
+    assert sums is not None
+    means = sums[:, :-1] / sums[:, -1:]
+    lengths = np.linalg.norm(means[:, 3:6], axis=1)
+    means[:, 3:6] /= np.maximum(lengths, 1e-300)[:, None]
     kept = lengths > 0.1  # the rest has no normal
-    return means[kept, :3], means[kept, 3:] / lengths[kept, None]
+    return means[kept, :3], means[kept, 3:]
 
 
-def _sides(points_m: Array, normals: Array, weights: Array) -> Iterator[tuple[int, tuple[Array, Array, Array]]]:
+def _sides(points_m: Array, attributes: Array, weights: Array) -> Iterator[tuple[int, tuple[Array, Array, Array]]]:
     """Yield the oriented points of either half of all directions, so that both sides of a sheet do not cancel."""
-    ahead = normals @ HALVES > 0.0
+    ahead = attributes[:, :3] @ HALVES > 0.0
     for half, chosen in enumerate((ahead, ~ahead)):
-        yield half, (points_m[chosen], normals[chosen], weights[chosen])
+        yield half, (points_m[chosen], attributes[chosen], weights[chosen])
+
+
+def _posed_points(view: RayImage, object_from_camera: Array, step: int) -> tuple[Array, Array, Array]:
+    """Return some points (n, 3) of a view; normals, RGB and whether it has colour (n, 7); and weights (n,)."""
+    points_m = se3.transform(object_from_camera, view.points_m[::step])
+    normals = view.normals[::step] @ object_from_camera[:3, :3].T
+    colour, (rows, columns) = view.frame.colour, view.pixels[::step].T
+    rgb = np.zeros_like(points_m) if colour is None else colour[rows, columns]
+    coloured = np.full((len(points_m), 1), colour is not None)
+    return points_m, np.concatenate([normals, rgb, coloured], axis=1), np.ones(len(points_m))
 
 
 def _summed(keys: npt.NDArray[np.int64], values: Array) -> tuple[npt.NDArray[np.int64], Array]:

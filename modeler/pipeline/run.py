@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from modeler.closure import Placement
-from modeler.fusion import Preview, conditional_covariances, widened
+from modeler.fusion import conditional_covariances, widened
 from modeler.graph import MovingGraph, estimate_focal_length, shared_noise, variance_factor
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.correcting import (
@@ -80,8 +80,7 @@ class Run:
     """Results of the frames so far."""
 
     def __post_init__(self) -> None:
-        """Start with an empty preview."""
-        self._preview = Preview(self.modeler.fuser)
+        """Start without frames."""
         self._with_other_masks: set[int] = set()  # views with masks that their frames alone do not show
         self._found: dict[int, bytes] = {}  # masks of the object, where views show what is beside it as well
         self._solved: State | None = None
@@ -433,7 +432,7 @@ class Run:
             edges=tuple(edges),
             left_out=prepared.left_out,
             solution=solution,
-            make_model=partial(self._preview.model, views, solution.trajectory),
+            make_model=partial(self.modeler.fuser.preview, views, solution.trajectory),
             edges_so_far=self.state.graph.edges,
             views={**views, **compared},
         )

@@ -99,13 +99,11 @@ def _registration() -> None:
 
 def _fusion() -> None:
     """Compare the colours of two frames of a bundled sequence, and fuse them."""
-    from modeler.fusion import IncrementalTsdf
     from modeler.verdict.colour_fit import colour_fit
 
     modeler, views, trajectory = _prepared()
     by_frame = {view.index: view for view in views}
     colour_fit(by_frame, trajectory)
-    IncrementalTsdf(modeler.fuser).updated(by_frame, trajectory).model()
     modeler.fuser.fuse(by_frame, trajectory)
 
 

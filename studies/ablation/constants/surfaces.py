@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.evaluation import rotation_error_deg
-from modeler.fusion import Fuser, Matcher, Preview, SymmetryFinder
+from modeler.fusion import Fuser, Matcher, SymmetryFinder
 from modeler.types import Array, Camera, Float32Array, ObjectModel
 from studies.ablation.constants.inputs import Figures, Posed, digest
 
@@ -66,12 +66,8 @@ def _digest_of(model: ObjectModel) -> str:
 
 
 def preview(posed: Posed) -> Figures:
-    """Make the preview of a run in progress, view by view."""
-    shown, model = Preview(Fuser()), None
-    frames = sorted(posed.trajectory)
-    for count in range(1, len(frames) + 1, 4):
-        some = frames[:count]
-        model = shown.model({f: posed.views[f] for f in some}, {f: posed.trajectory[f] for f in some})
+    """Make the preview of a run in progress."""
+    model = Fuser().preview(posed.views, posed.trajectory)
     assert model is not None
     return {"digest": _digest_of(model), "vertices": float(len(model.vertices_m))}
 

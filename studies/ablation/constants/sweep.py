@@ -157,12 +157,10 @@ def stages_of(number: Number, names: Sequence[tuple[str, str]]) -> list[tuple[st
             wanted = ("symmetries",)
         case "fusion", "watertight":
             wanted = ("closed",)
-        case "fusion", "incremental_tsdf":
-            wanted = ("preview",)
         case "fusion", "by_focal":
             wanted = ("poses",)
         case "fusion", _:
-            wanted = ("surface", "preview") if number.name.startswith("Fuser.preview") else ("surface",)
+            wanted = ("preview",) if number.name.startswith("PREVIEW") else ("surface",)
         case "priors", _:
             wanted = ("densities", "poses")  # in this order
         case _:
