@@ -31,7 +31,6 @@ class Server:
     def __init__(self, capture: Path, out: Path) -> None:
         command = [sys.executable, "-m", "modeler", "studio", str(capture), "--out", str(out)]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=out.parent)
-        assert self.process.stderr is not None
         for line in self.process.stderr:
             if (found := re.search(r"open (http://127\.0\.0\.1:(\d+)/\?token=(\S+)) in", line)) is not None:
                 self.address, self.port, self.token = found[1], int(found[2]), found[3]
@@ -62,7 +61,6 @@ class Server:
         return self._wait()
 
     def _wait(self) -> int:
-        assert self.process.stderr is not None
         self.process.stderr.close()
         return self.process.wait(30)
 

@@ -41,7 +41,6 @@ def test_without_a_table_motion_is_free() -> None:
 
 def test_limits_are_left_only_where_both_were_assumed() -> None:
     unlimited = AutoPrior().unlimited()
-    assert unlimited is not None
     assert isinstance(unlimited.free, AnyMotion)
     assert AutoPrior(free=GeneralPrior()).unlimited() is None
     assert AutoPrior(table=TablePrior()).unlimited() is None

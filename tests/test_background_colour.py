@@ -48,7 +48,6 @@ def share(some: BoolArray, of: BoolArray) -> float:
 def test_what_depth_holds_too_much_goes_and_the_object_stays(shade: float, rng: np.random.Generator) -> None:
     frames, true, filled = frames_of(RED, rng, shade)
     background = BackgroundColour.learned(frames, filled)
-    assert background is not None
     known = np.zeros(ROWS.shape, dtype=np.bool_)
     known[background.window] = background.known
     for frame, object_px, wide in zip(frames, true, filled, strict=True):
@@ -87,7 +86,6 @@ def test_where_the_background_is_never_seen_depth_decides(rng: np.random.Generat
 def test_colours_behind_an_object_are_those_that_other_frames_show(rng: np.random.Generator) -> None:
     frames, _, filled = frames_of(RED, rng)
     background = BackgroundColour.learned(frames, filled)
-    assert background is not None
     rows, _ = background.window
     expected: npt.NDArray[np.int64] = np.where((ROWS < 60)[..., None], WALL, FLOOR)[background.window]
     assert rows.start > 0

@@ -202,7 +202,6 @@ def test_icp_stops_where_open3d_would(pair: Pair, rng: np.random.Generator) -> N
     source, target = (Cloud.of(view) for view in pair)
     initial = start(pair[0], pair[1], GeneralPrior(40.0, 0.03).between(*pair), rng)
     fit = method.refine(source, target, initial.target_from_source)
-    assert fit is not None
     voxel_m = cube_edges_m(source, target, method.voxels)[-1]
     reach_m = method.reach * voxel_m
     clouds = []
@@ -227,7 +226,6 @@ def printed_ball(turn_deg: float, seed: int) -> RayImage:
     """Return a ball with a smooth print, turned about its vertical axis: all that depth shows is where it is."""
     turn = se3.exp(np.array([0.0, 0.0, np.radians(turn_deg), 0.0, 0.0, 0.0]))
     seen = tabletop.view(tabletop.BALL, POSES[0] @ turn, seed, rng=np.random.default_rng(seed), table=False)
-    assert seen.frame.colour is not None
     on_ball = se3.transform(se3.inverse(POSES[0] @ turn), seen.points_m)
     grey = 128.0 + 90.0 * np.sin(90.0 * on_ball[:, 0]) * np.cos(70.0 * on_ball[:, 1] + 40.0 * on_ball[:, 2])
     colour = seen.frame.colour.copy()
@@ -254,7 +252,6 @@ def test_coloured_icp_stops_where_open3d_would() -> None:
     reach_m = method.reach * voxel_m
     clouds = []
     for cloud in thin:
-        assert cloud.intensity is not None
         points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
         points.normals = o3d.utility.Vector3dVector(cloud.normals)
         points.colors = o3d.utility.Vector3dVector(np.repeat(cloud.intensity[:, None], 3, axis=1))

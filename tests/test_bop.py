@@ -97,7 +97,6 @@ def test_grey_pictures_become_rgb(scene: Path, mode: str, grey: int) -> None:
     pixels = np.full((30, 40), grey if mode == "L" else grey * 256 + 13, np.uint8 if mode == "L" else np.uint16)
     Image.fromarray(pixels).save(scene / "rgb" / "000003.png")
     colour = BopSequence(scene).frame(3).colour
-    assert colour is not None
     assert colour.shape == (30, 40, 3)
     assert (colour == grey).all()
 
@@ -107,7 +106,6 @@ def test_jpeg_colour_is_read(tmp_path: Path, frames: list[Frame]) -> None:
     write_bop(tmp_path / "s", flat, colour_suffix=".jpg")
     assert (tmp_path / "s" / "rgb" / "000003.jpg").is_file()
     colour = BopSequence(tmp_path / "s").frame(3).colour
-    assert colour is not None
     assert np.abs(colour.astype(int) - 99).max() <= 2
 
 

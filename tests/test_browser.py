@@ -121,7 +121,6 @@ def site(tmp_path: Path) -> Iterator[tuple[Path, str]]:
         pytest.skip("npm's registry cannot be reached")
     with tarfile.open(next(tmp_path.glob("*.tgz"))) as archive:
         script = archive.extractfile("package/dist/model-viewer.min.js")
-        assert script is not None
         (folder / "viewer.js").write_bytes(script.read())
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)

@@ -172,7 +172,6 @@ def test_register_prints_one_edge_the_same_for_the_same_seed(cli: Run, scene: Pa
     assert (edge["source"], edge["target"], edge["kind"], edge["outcome"]) == (1, 0, "odometry", "converged")
     assert "seconds" not in edge
     truth = open_sequence(scene).truth()
-    assert truth is not None
     found = np.array(edge["target_from_source"]).reshape(4, 4)
     error = se3.inverse(truth[0] @ se3.inverse(truth[1])) @ found
     assert np.degrees(se3.rotation_angle(error)) < 2.0

@@ -108,7 +108,6 @@ sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
 def test_defaults_stated_in_help_are_those_of_the_priors(build_help: str, name: str) -> None:
     words = " ".join(build_help.replace("│", " ").split())
     given = re.search(rf"--{name.replace('_', '-')} .*?\(default: (\S+)\)", words)
-    assert given is not None
     defaults = {
         field.default
         for prior in vars(priors).values()

@@ -49,7 +49,6 @@ def test_noise_is_of_the_size_and_the_correlation_that_the_camera_has(name: str)
     again = camera.measure(WORLD, np.random.default_rng(1), 0).astype(np.float32)
     frames = [Frame(0, 0.0, shown, camera.camera, seen.on_object) for shown in (depth_m, again)]
     noise = range_noise([(frame, seen.on_object) for frame in frames])
-    assert noise is not None
     assert (noise.area_px > 20.0) == (name in ("Kinect 1", "D415, holes filled", "D435"))
     fixed = {"Kinect 1": 0.5, "D415, holes filled": 0.75, "D435": 0.75}.get(name, 0.0)
     assert noise.pattern_share == pytest.approx(fixed, abs=0.15)

@@ -105,7 +105,6 @@ def test_3mf_is_read_by_its_library_with_unit_and_colours(tmp_path: Path, colour
     corners = np.array([tuple(triangle.Indices) for triangle in solid.GetTriangleIndices()])
     np.testing.assert_allclose(places[corners], model.vertices_m[model.triangles], atol=1e-7)
     if coloured:
-        assert model.vertex_colours is not None
         properties = solid.GetAllTriangleProperties()
         group = content.GetColorGroupByID(properties[0].ResourceID)
         for corner, found in zip(corners, properties, strict=True):

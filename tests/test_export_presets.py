@@ -116,7 +116,6 @@ def written(folder: Path) -> tuple[solids.PhysicsFiles, solids.Body]:
 def test_simulators_files_hold_mass_and_inertia_in_their_own_order(tmp_path: Path) -> None:
     of, body = written(tmp_path)
     inertial = ElementTree.parse(of.mjcf).find(".//inertial")
-    assert inertial is not None
     xx, yy, zz, xy, xz, yz = map(float, inertial.attrib["fullinertia"].split())
     np.testing.assert_allclose([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], body.inertia_kg_m2, rtol=1e-7)
     tree = ElementTree.parse(of.urdf)
@@ -324,11 +323,9 @@ def _check_bop(out: Path, built: Path) -> None:
     scene = out / "onboarding_static" / "obj_000001_up"
     sequence = open_sequence(scene)
     truth, info = sequence.truth(), json.loads((scene / "scene_gt_info.json").read_text())
-    assert truth is not None
     assert {str(index) for index in sequence.indices} == {*info}
     for index in sequence.indices:
         frame = sequence.frame(index)
-        assert frame.mask is not None
         points = se3.transform(truth[index], np.asarray(mesh.vertices) / 1000.0)
         column = np.rint(points[:, 0] / points[:, 2] * frame.camera.fx + frame.camera.cx).astype(int)
         row = np.rint(points[:, 1] / points[:, 2] * frame.camera.fy + frame.camera.cy).astype(int)

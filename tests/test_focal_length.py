@@ -43,7 +43,6 @@ def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
     """By registering again under others. Turns are left out: of one pair their derivatives are known to some 0.1."""
     sequence, prior, step = open_sequence(bundled("box")), GeneralPrior(), 0.02
     noise = sequence.sensor()
-    assert noise is not None
     sensor = Sensor(noise._replace(sigma_focal=step))
     target, source = (sensor.ray_image(sequence.frame(index)) for index in (1, 2))
 
@@ -264,7 +263,6 @@ def test_covariances_are_those_of_a_graph_with_the_focal_length_as_a_variable(rn
 
 def _small(frame: Frame) -> Frame:
     camera, mask = frame.camera, frame.mask
-    assert mask is not None
     small = Camera(160, 120, camera.fx / 4, camera.fy / 4, camera.cx / 4, camera.cy / 4)
     return replace(frame, depth_m=frame.depth_m[::4, ::4].copy(), camera=small, mask=mask[::4, ::4], colour=None)
 
@@ -274,7 +272,6 @@ def built(sigma_focal: float) -> tuple[Step, dict[int, Array]]:
     """The last step of a run, of small images, whose focal length is stated 3 % too long, and the true poses."""
     whole = open_sequence(bundled("box"))
     noise, truth = whole.sensor(), whole.truth()
-    assert noise is not None
     assert truth is not None
     frames = [_small(frame) for frame in RefocusedSequence(whole, FocalFactor(1.03, whole.frame(0).camera.fx))]
     modeler = Modeler(sensor=Sensor(noise._replace(sigma_focal=sigma_focal)), prior=TablePrior())
@@ -286,7 +283,6 @@ def built(sigma_focal: float) -> tuple[Step, dict[int, Array]]:
 def test_poses_and_views_of_a_run_are_those_of_the_focal_length_that_its_loops_tell() -> None:
     (shown, truth), (held, _) = built(0.02), built(0.0)
     focal = shown.solution.focal
-    assert focal is not None
     assert held.solution.focal is None
     assert focal.determined_by == "loop"
     assert focal.factor == pytest.approx(1.0 / 1.03, abs=0.01)

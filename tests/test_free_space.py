@@ -106,7 +106,6 @@ def test_nearest_ranges_are_least_within_the_ellipse(rng):
 def test_motions_drawn_by_number_are_those_of_the_prior():
     count = 200_000
     draws = NumberedDraws.of(MOTION, np.random.default_rng(3))
-    assert draws is not None
     poses = matrices(draws.poses(0, count))
     assert np.isfinite(MOTION.log_density(poses)).all()
     turns = poses[:, :3, :3]
@@ -148,7 +147,6 @@ def test_which_motions_pass_depends_on_no_thread_and_no_batch(rng):
     free = FreeSpace.of(scene(rng, NOISES["isotropic"]), scene(rng, NOISES["isotropic"]), 4.0, 1e-6)
     spread = GeneralDensity(CENTRE_M, CENTRE_M, 0.3, 0.04)
     draws = NumberedDraws.of(spread, rng)
-    assert draws is not None
     drawn = draws.poses(0, 30_000)
     passes = free.passes(drawn)
     assert 0 < passes.sum() < 30_000

@@ -137,7 +137,6 @@ def haunted(ghost_depth_m: float = 0.77) -> dict[int, RayImage]:
     """Return views of the ball; in the first one a patch that is not there hangs beside it, as part of the object."""
     views = tabletop.views(BALL, POSES)
     frame = views[0].frame
-    assert frame.mask is not None
     depth_m, mask = frame.depth_m.copy(), frame.mask.copy()
     depth_m[60:72, 121:133], mask[60:72, 121:133] = ghost_depth_m, True
     ghostly = replace(frame, depth_m=depth_m, mask=mask)
@@ -382,15 +381,12 @@ def test_a_view_that_many_contradict_counts_less():
 
 
 def dimmed(view: RayImage, factor: float) -> RayImage:
-    assert view.frame.colour is not None
     return replace(view, frame=replace(view.frame, colour=(view.frame.colour * factor).astype(np.uint8)))
 
 
 def test_differences_of_exposure_are_evened_out(brick):
     views = {k: dimmed(view, 0.6 if k % 3 == 0 else 0.9) for k, view in tabletop.views(BRICK, POSES).items()}
     model = FUSER.fuse(views, tabletop.trajectory(POSES))
-    assert model.vertex_colours is not None
-    assert brick.vertex_colours is not None
     ratio = np.log(model.vertex_colours / brick.vertex_colours).mean(axis=1)
     assert np.std(ratio) < 0.03  # against 0.2 between the frames
     assert np.exp(ratio.mean()) == pytest.approx(0.79, abs=0.05)
@@ -420,15 +416,12 @@ def test_what_a_lamp_shades_in_turn_gets_one_colour() -> None:
 
 def test_highlights_of_single_views_leave_no_trace(brick):
     def shining(view: RayImage) -> RayImage:
-        assert view.frame.colour is not None
         colour = view.frame.colour.copy()
         colour[tuple(view.pixels[: len(view.pixels) // 8].T)] = 235
         return replace(view, frame=replace(view.frame, colour=colour))
 
     views = {k: shining(view) if k % 5 == 0 else view for k, view in tabletop.views(BRICK, POSES).items()}
     model = FUSER.fuse(views, tabletop.trajectory(POSES))
-    assert model.vertex_colours is not None
-    assert brick.vertex_colours is not None
     assert np.quantile(np.abs(model.vertex_colours.astype(int) - brick.vertex_colours), 0.99) <= 8
 
 
@@ -436,7 +429,6 @@ def test_colours_count_less_where_they_may_be_those_of_the_background(monkeypatc
     """Colour that is 4 px beside its depth: what one view sees at its silhouette, another sees within."""
     poses, views = tabletop.trajectory(POSES), tabletop.views(PLATE, POSES)
     true = FUSER.fuse(views, poses)
-    assert true.vertex_colours is not None
     for index, view in views.items():
         assert view.frame.colour is not None
         views[index] = replace(view, frame=replace(view.frame, colour=np.roll(view.frame.colour, 4, axis=1)))
@@ -445,7 +437,6 @@ def test_colours_count_less_where_they_may_be_those_of_the_background(monkeypatc
         monkeypatch.setattr("modeler.fusion.depth_views.BLEEDING_PX", bleeding_px)
         model = FUSER.fuse(views, poses)
         assert same(replace(model, vertex_colours=None, colours=None), replace(true, vertex_colours=None, colours=None))
-        assert model.vertex_colours is not None
         off[bleeding_px] = float(np.abs(model.vertex_colours.astype(int) - true.vertex_colours).mean())
     assert off[10.0] < 0.9 * off[0.01]
 
@@ -455,8 +446,6 @@ def test_a_view_without_colour_leaves_the_colours_to_others(brick):
     views[4] = replace(views[4], frame=replace(views[4].frame, colour=None))
     trajectory = tabletop.trajectory(POSES)
     for model in (FUSER.fuse(views, trajectory), FUSER.preview(views, trajectory)):
-        assert model is not None
-        assert model.colours is not None
         top = (np.abs(model.points_m[:, :2]) < [0.05, 0.03]).all(axis=1) & (model.points_m[:, 2] > 0.03)
         assert np.abs(model.colours[top].astype(int) - [128, 128, 228]).max() <= 2
 
@@ -465,7 +454,6 @@ def test_what_stands_right_before_the_background_is_carved():
     # A flap of one view's mask that lies on the table: no view looks through it, but others see the table there.
     views, trajectory = tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)
     frame = views[0].frame
-    assert frame.mask is not None
     rows = np.flatnonzero(frame.mask.any(axis=1))
     mask = frame.mask.copy()
     mask[rows[-1] - 4 : rows[-1] + 8, 90:100] = True
@@ -491,7 +479,6 @@ def tensor(values, kind):
 def test_bundled_objects_are_fused_within_3_mm(name):
     sequence = BopSequence(Path(__file__).parents[1] / "sequences" / "bundled" / name)
     truth, noise = sequence.truth(), sequence.sensor()
-    assert truth is not None
     assert noise is not None
     sensor = Sensor(noise)
     frames = {frame.index: frame for frame in sequence}
@@ -511,7 +498,6 @@ def test_bundled_objects_are_fused_within_3_mm(name):
 
 def true_points(frame: Frame, camera_from_model, scene):
     """Return the points (n, 3) of the true surface at the object's measured pixels, in the model frame."""
-    assert frame.mask is not None
     seen = frame.mask & np.isfinite(frame.depth_m)
     w, h = (side[seen] for side in frame.camera.rays())
     model_from_camera = se3.inverse(camera_from_model)

@@ -43,7 +43,6 @@ def test_a_watertight_model_stands_on_its_table(seed: int) -> None:
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(8.0 * np.prod(BRICK.half_m), rel=0.01)
     vertices_m = se3.transform(se3.inverse(object_from_model), model.vertices_m)
-    assert model.vertex_views is not None
     under = (np.abs(vertices_m[:, :2]) < 0.04).all(axis=1) & (vertices_m[:, 2] < 0.0)
     assert (model.vertex_views[under] == 0).all()
     np.testing.assert_allclose(vertices_m[under, 2], -BRICK.half_m[2], atol=0.5 * VOXEL_M)
@@ -85,14 +84,12 @@ def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
         assert np.array_equal(edge_uses(model.triangles), np.ones((len(mesh.edges_unique), 2)))
         assert mesh.body_count == 1
         assert model.vertex_views is not None
-        assert model.vertex_sigmas_m is not None
         made_up = model.vertex_views == 0
         assert np.isinf(model.vertex_sigmas_m[made_up]).all()
         assert np.quantile(np.abs(body.distance(model.vertices_m[~made_up])), 0.95) < 0.5 * VOXEL_M
         assert np.abs(body.distance(model.vertices_m)).max() < 0.025
     # Of a brick, the bottom was made up, and lies where it is.
     brick = FUSER.volume(tabletop.views(BRICK, POSES), tabletop.trajectory(POSES)).model(watertight=True)
-    assert brick.vertex_views is not None
     under = brick.vertices_m[:, 2] < -BRICK.half_m[2] + 1e-3
     core = (np.abs(brick.vertices_m[:, :2]) < 0.04).all(axis=1) & (brick.vertices_m[:, 2] < 0.0)
     assert (brick.vertex_views[core] == 0).all()

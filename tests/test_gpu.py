@@ -68,7 +68,6 @@ def test_the_papers_draws_that_pass_are_those_of_numba_in_their_order(device, rn
     monkeypatch.setattr(on_gpu, "AT_ONCE", 3000)  # several launches, the last one short
     source, target = (measured(standing(index), 12, rng) for index in (1, 0))
     draws = NumberedDraws.of(GeneralPrior(25.0, 0.02).between(standing(1), standing(0)), np.random.default_rng(3))
-    assert draws is not None
     free = FreeSpace.of(source, target, 4.0, 1e-6).ordered(draws.poses(0, 500))
     views = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in (source, target)]
     there = on_gpu.OnDevice.of(gpu.chosen(device, 1) or "", views, (free.checks, free.near_m, free.images), (4.0, 1e-6))

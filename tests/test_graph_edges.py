@@ -117,7 +117,6 @@ def test_the_opening_of_a_loop_is_in_units_of_what_its_edges_state() -> None:
     for _ in range(300):
         graph, _ = ring(COUNT, rng, [(0, COUNT - 1)])
         error = loop_closure_error(graph.edges, Solution(), {})
-        assert error is not None
         assert (error.source, error.target, error.edges) == (COUNT - 1, 0, COUNT - 1)
         squares.append(error.sigmas**2)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.15)  # sd of the mean 0.033, and first order
@@ -130,7 +129,6 @@ def test_the_opening_of_a_loop_is_what_a_closure_was_turned_by() -> None:
     closure = edge(0, 7, PoseGaussian(_true(truth, 0, 7) @ spin([0.0, 0.1, 0.0]), covariance(rng)), "closure")
     centroid_m = {7: OBJECT_M}
     error = loop_closure_error([*exact, closure], Solution(), centroid_m)
-    assert error is not None
     assert error.rotation_rad == pytest.approx(0.1)
     assert error.translation_m == pytest.approx(0.0, abs=1e-9)
     refused = edge(0, 7, closure.posterior.pose, "closure", accepted=False)

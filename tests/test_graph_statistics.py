@@ -187,8 +187,6 @@ def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None
         spread_of_positions(dict.fromkeys(TRUTH, seen), solution, AboutMean.of(solution), 0.005)
         for solution in (alone, shifted)
     ]
-    assert spreads[0] is not None
-    assert spreads[1] is not None
     assert spreads[1].check.value == pytest.approx(spreads[0].check.value, rel=1e-6)
     assert np.trace(shifted.covariances[COUNT // 2][3:, 3:]) > 2.0 * np.trace(alone.covariances[COUNT // 2][3:, 3:])
 

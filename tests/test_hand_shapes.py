@@ -71,7 +71,6 @@ def test_marks_of_masks_remain(tmp_path: Path) -> None:
     poses = HandPoses(np.arange(2.0), np.stack([AHEAD, AHEAD]))
     plain = open_sequence(written(tmp_path / "scene", None))
     occluder = HandMarkedSequence(Marked(plain), FINGER, poses).frame(1).occluder
-    assert occluder is not None
     assert occluder[0, 0]
     assert occluder[23, 31]
 

@@ -232,7 +232,6 @@ def test_masks_count_from_the_middle_of_their_range(
 
 def test_cut_out_objects_are_masks(tmp_path: Path, frames: list[Frame]) -> None:
     mask, colour = frames[0].mask, frames[0].colour
-    assert mask is not None
     assert colour is not None
     save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
     save(tmp_path / "masks" / "0.png", np.dstack([colour, mask.astype(np.uint8) * 255]))
@@ -286,7 +285,6 @@ def test_files_of_yaml_without_a_camera_are_passed_over(tmp_path: Path, frames: 
 
 def test_palette_masks_are_labels(tmp_path: Path, frames: list[Frame]) -> None:
     mask = frames[0].mask
-    assert mask is not None
     save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
     (tmp_path / "masks").mkdir()
     labels = Image.fromarray(mask.astype(np.uint8), mode="P")

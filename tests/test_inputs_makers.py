@@ -238,7 +238,6 @@ def test_values_that_are_given_count_before_those_of_a_camera(maker: str, shown:
     sequence = open_sequence(f"{maker}:", Overrides(intrinsics=(100.0, 101.0, 40.0, 30.0), depth_scale_mm=2.0))
     frame = next(iter(sequence))
     noise = sequence.sensor()
-    assert noise is not None
     assert noise.sigma_focal == NOMINAL_FOCAL
     assert (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy) == (100.0, 101.0, 40.0, 30.0)
     wrote = FRAMES[round(frame.time_s / 0.1) % len(FRAMES)]

@@ -50,7 +50,6 @@ def unmasked(frame: Frame) -> Frame:
 def filled(frame: Frame) -> Frame:
     """Return the part of a frame in which there is nothing but the object."""
     assert frame.mask is not None
-    assert frame.colour is not None
     rows, columns = np.nonzero(frame.mask)
     top, left = int(np.percentile(rows, 30)), int(np.percentile(columns, 30))
     cut = slice(top, top + 24), slice(left, left + 24)
@@ -124,8 +123,6 @@ def test_an_object_that_fills_the_image_is_modelled_where_masks_say_so(frames: l
 
 def thinned(frame: Frame, step: int) -> Frame:
     """Return every so many-th pixel of a frame."""
-    assert frame.mask is not None
-    assert frame.colour is not None
     old, kept = frame.camera, (slice(None, None, step), slice(None, None, step))
     camera = Camera(old.width // step, old.height // step, old.fx / step, old.fy / step, old.cx / step, old.cy / step)
     return replace(frame, depth_m=frame.depth_m[kept], mask=frame.mask[kept], colour=frame.colour[kept], camera=camera)

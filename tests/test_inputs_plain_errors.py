@@ -61,14 +61,12 @@ def test_aligned_colour_is_believed(tmp_path: Path) -> None:
 
 def test_mirrored_colour_is_reported(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", mirrored=True)
-    assert found.misaligned is not None
     assert found.misaligned.flip == "mirrored"
     assert found.doubts[0].startswith("colour is mirrored")
 
 
 def test_shifted_colour_is_reported_by_how_much(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", shift_px=(20.0, -12.0))
-    assert found.misaligned is not None
     assert not found.misaligned.flip
     assert found.misaligned.scale == (1.0, 1.0)
     assert found.misaligned.shift_px == pytest.approx((20.0, -12.0), abs=2.0)
@@ -79,7 +77,6 @@ def test_shifted_colour_is_reported_by_how_much(tmp_path: Path) -> None:
 
 def test_colour_of_another_lens_is_reported(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", scale=1.25, shift_px=(-12.0, 0.0))
-    assert found.misaligned is not None
     assert found.misaligned.scale == pytest.approx((1.25, 1.25), abs=0.05)
     assert found.misaligned.shift_px == pytest.approx((-12.0, 0.0), abs=4.0)
 
@@ -237,7 +234,6 @@ def test_images_packed_by_rvl_are_read(frames: list[Frame], rng: np.random.Gener
 @pytest.mark.parametrize(("mirrored", "flip"), [(False, "upside down"), (True, "flipped top to bottom")])
 def test_colour_upside_down_is_reported(tmp_path: Path, *, mirrored: bool, flip: str) -> None:
     found = cards(tmp_path / "s", upside_down=True, mirrored=mirrored)
-    assert found.misaligned is not None
     assert found.misaligned.flip == flip
     assert found.misaligned.is_sure
 

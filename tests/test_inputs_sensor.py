@@ -46,8 +46,6 @@ def measured(still_folder: Path) -> Calibration:
 
 def test_noise_along_the_ray_is_that_of_the_renderer(still: RenderedSequence, measured: Calibration) -> None:
     camera = still.recipe.sensor
-    assert camera is not None
-    assert camera.disparity is not None
     focal_baseline = still.recipe.view.focal_px * abs(camera.baseline_m)
     off = []
     for one in measured.bins:
@@ -115,7 +113,6 @@ def test_what_is_stored_is_what_is_used(
     )
     noise = open_sequence(tmp_path / "b").sensor()
     box = open_sequence(bundled("box"))
-    assert noise is not None
     assert noise[:2] == pytest.approx(stored.at(object_distance_m(box.frame(0))))
 
 

@@ -84,7 +84,6 @@ def test_masks_that_most_frames_are_unsure_of_stay_unsure(going_round, monkeypat
         )
         *_, last = modeler.Modeler().run(frames, scene)
         assert isinstance(last, Step)
-        assert last.verdict is not None
         assert ("unsure_masks" in [fault.code for fault in last.verdict.shortcomings]) == (len(few) > 4)
 
 

@@ -50,8 +50,6 @@ def turned(
 def seen(sequence: RenderedSequence, index: int) -> tuple[Array, Array]:
     """Return points (n, 3) of the object that a view shows, in its camera frame, and their linear colours (n, 3)."""
     frame = sequence.frame(index)
-    assert frame.mask is not None
-    assert frame.colour is not None
     rays = np.stack([*frame.camera.rays(), np.ones(frame.mask.shape)], axis=-1)
     points_m = (rays * frame.depth_m[..., None])[frame.mask]
     return points_m, linear_light(frame.colour[frame.mask] / 255.0)
@@ -62,7 +60,6 @@ def carried_colours(sequence: RenderedSequence) -> tuple[Array, Array, Array]:
     truth, target = sequence.truth(), sequence.frame(1)
     points_m, colours = seen(sequence, 0)
     there_m = se3.transform(truth[1] @ se3.inverse(truth[0]), points_m)
-    assert target.colour is not None
     image, camera = linear_light(target.colour / 255.0), target.camera
     found = []
     for at_m in (there_m, points_m):
@@ -147,8 +144,6 @@ def test_highlights_stay_with_the_camera() -> None:
         sequence = turned(shape, 0.0, 37.3, photography=glossy)
         first, second = (sequence.frame(index) for index in (0, 1))
         assert first.mask is not None
-        assert first.colour is not None
-        assert second.colour is not None
         apart = np.abs(first.colour.astype(int) - second.colour.astype(int))[first.mask]
         assert np.mean(apart > 1) < 0.03  # edges, which are polygons
         assert np.ptp(first.colour[first.mask].astype(int)) > 40  # yet light varies
@@ -232,8 +227,6 @@ def side_view(shape: AnyShape, label: Label, turn_deg: float) -> np.ndarray:
     places = Places((Place(rotation_deg=(0.0, 0.0, turn_deg)),))
     recipe = Recipe(shape, view=view, table=None, trajectory=places, sensor=None, colour="png")
     frame = RenderedSequence(replace(recipe, label=label, photography=replace(FLAT, ambient=1.0))).frame(0)
-    assert frame.mask is not None
-    assert frame.colour is not None
     rows, columns = np.flatnonzero(frame.mask.any(axis=1)), np.flatnonzero(frame.mask.any(axis=0))
     return frame.colour[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 

@@ -34,7 +34,6 @@ def turned(name: str) -> tuple[Views, Array]:
     sequence = RenderedSequence(replace(recipe, trajectory=places))
     noise, truth = sequence.sensor(), sequence.truth()
     assert noise is not None
-    assert truth is not None
     loop, frames = Modeler(sensor=Sensor(noise)), [sequence.frame(index) for index in (0, 1)]
     first, second = (loop.prepare(frame, loop.segmenter.scene(frames)).view for frame in frames)
     assert first is not None
@@ -65,7 +64,6 @@ def features(frame: Frame, normals: Array | None = None) -> np.ndarray:
 
 def test_exposure_does_not_change_features(rng):
     frame = picture(rng)
-    assert frame.colour is not None
     brighter = replace(frame, colour=(1.2 * (frame.colour.astype(float) + 4.0) - 4.0).round().astype(np.uint8))
     found, changed = features(frame), features(brighter)
     for band in range(colours.BANDS):
@@ -90,7 +88,6 @@ def test_the_edge_between_faces_that_are_lit_unlike_is_no_feature(rng):
 
 def test_bands_are_differences_of_gaussian_means(rng):
     frame = picture(rng)
-    assert frame.colour is not None
     image = features(frame).reshape(colours.BANDS, 3, 60, 80)
     logs = np.log(frame.colour + 4.0).mean(axis=2)
     inside = (slice(20, -20), slice(20, -20))
@@ -147,7 +144,6 @@ def test_curvatures_are_those_of_the_likelihood(printed, seed: int):
 def test_moments_are_sums_over_matching_points(printed):
     views, truth = printed
     pair = VisibilityLikelihood(colour=True).between(views[0], views[1], np.random.default_rng(0))
-    assert pair.colour is not None
     both = pair.colour.colours(1, 1)
     sides = (*pair.surfaces(1), pair.forward.parameters(0.002), pair.backward.parameters(0.002))
     found = scores.scores(rows(truth[None]), *sides, both)[0, scores.PRODUCT :]
@@ -169,7 +165,6 @@ def test_moments_are_sums_over_matching_points(printed):
 def test_equations_of_features_are_those_of_planes_with_their_gradient(printed):
     views, truth = printed
     pair = VisibilityLikelihood(colour=True).between(views[0], views[1], np.random.default_rng(0))
-    assert pair.colour is not None
     pose, weight = se3.moved(truth[None], np.full((1, 6), 0.004), pair.centre_m)[0], 3.0
     both = pair.colour.colours(1, 1)
     gradients_of, matrices_of = gauss_newton.normal_equations(
@@ -221,7 +216,6 @@ def test_what_stays_in_its_place_is_found_though_centroids_err(printed):
     assert view.frame.colour is not None
     aside = replace(view, frame=replace(view.frame, colour=np.roll(view.frame.colour, (1, -1), axis=(0, 1))))
     pair = VisibilityLikelihood().between(view, aside, np.random.default_rng(0))
-    assert pair.colour is not None
     assert all(pair.colour.static_correlation(band) > 0.8 for band in range(3))
 
 
@@ -237,7 +231,6 @@ def test_a_shift_of_colours_widens_the_spin_and_does_not_mislead(printed):
     shift_px = 0.7
     loose = [replace(view, sigma_colour_px=shift_px) for view in views]
     colour = loose[1].frame.colour
-    assert colour is not None
     moved = np.stack(
         [ndimage.shift(colour[..., k], (0.0, shift_px), order=1, mode="nearest") for k in range(3)], axis=-1
     )

@@ -112,7 +112,6 @@ class Oracle(AbstractRegistrar):
 
     def posterior_of(self, pair: ViewPair) -> Posterior:
         if pair.effort < 1.0:
-            assert self.quick is not None
             return self.quick.posterior_of(replace(pair, effort=1.0))
         density = pair.density
         if isinstance(density, DefensiveMixture):  # the graph foretells it
@@ -346,7 +345,6 @@ def test_the_mesh_is_made_though_the_last_frames_are_lost(lost: tuple[int, ...])
     last = run([blank(k) if k in lost else FRAMES[k] for k in range(4)])[-1]
     assert last.last
     assert not last.accepted
-    assert last.model is not None
     assert len(last.model.triangles) > 0
 
 
@@ -398,8 +396,6 @@ def test_same_seed_same_bits_side_by_side_or_one_after_the_other(monkeypatch: py
     assert len(one.edges_so_far) > 8
     for k, pose in one.solution.trajectory.items():
         assert np.array_equal(pose, other.solution.trajectory[k])
-    assert one.model is not None
-    assert other.model is not None
     assert np.array_equal(one.model.vertices_m, other.model.vertices_m)
 
 
@@ -503,7 +499,6 @@ def test_what_is_kept_of_a_frame_is_light_and_makes_the_same_view_again() -> Non
     assert all(not len(edge.posterior.samples) for edge in steps[-1].edges_so_far)
     assert all(len(posterior.samples) for step in steps for posterior in step.posteriors)
     whole = steps[3].view
-    assert whole is not None
     again = Sensor().ray_image(steps[-1].views[3].frame, steps[-1].views[3].plane)
     assert set(again.layers) == set(whole.layers)
     assert np.array_equal(again.points_m, whole.points_m)
@@ -519,8 +514,6 @@ def _resized(frame: Frame, rows: slice, columns: slice) -> Frame:
         cx=frame.camera.cx - columns.start,
         cy=frame.camera.cy - rows.start,
     )
-    assert frame.mask is not None
-    assert frame.colour is not None
     window = (rows, columns)
     return replace(
         frame, depth_m=frame.depth_m[window], mask=frame.mask[window], colour=frame.colour[window], camera=camera
@@ -532,7 +525,6 @@ def test_frames_of_different_size_make_one_model() -> None:
     cut = [_resized(frame, slice(k, height), slice(0, width - 2 * k)) for k, frame in enumerate(FRAMES[:4])]
     last = run(cut)[-1]
     assert list(last.solution.trajectory) == [0, 1, 2, 3]
-    assert last.model is not None
     assert len(last.model.triangles) > 0
 
 

@@ -43,7 +43,6 @@ def plate(rng, count=2000, radius_m=0.12):
 
 def test_exact_points_give_the_exact_plane_towards_the_camera(rng):
     plane = fit_plane(plate(rng), sigma_m=0.001)
-    assert plane is not None
     np.testing.assert_allclose(plane.normal, NORMAL, atol=1e-9)
     assert plane.offset_m == pytest.approx(OFFSET_M)
     assert plane.height_m(np.zeros((1, 3)))[0] == pytest.approx(OFFSET_M)
@@ -53,7 +52,6 @@ def test_a_third_of_outliers_above_changes_nothing(rng):
     points = plate(rng) + rng.normal(0.0, 0.0005, (2000, 1)) * NORMAL
     outliers = plate(rng, 1000) + rng.uniform(0.01, 0.15, (1000, 1)) * NORMAL
     plane = fit_plane(np.concatenate([points, outliers]), sigma_m=0.001)
-    assert plane is not None
     assert tilt_rad(plane) < 0.001
     assert plane.offset_m == pytest.approx(OFFSET_M, abs=0.0005)
 
@@ -62,8 +60,6 @@ def test_the_fit_turns_with_the_points(rng):
     points = plate(rng) + rng.normal(0.0, 0.001, (2000, 1)) * NORMAL
     turn = Rotation.from_rotvec([0.0, 0.0, 0.8]).as_matrix()
     plane, turned = fit_plane(points, sigma_m=0.001), fit_plane(points @ turn.T, sigma_m=0.001)
-    assert plane is not None
-    assert turned is not None
     np.testing.assert_allclose(turned.normal, turn @ plane.normal, atol=1e-6)
     assert turned.sigma_offset_m == pytest.approx(plane.sigma_offset_m, rel=0.01)
 
@@ -85,7 +81,6 @@ def test_uncertainty_holds_under_correlated_noise(smooth_px):
         field = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(40, 40)), smooth_px)
         noise = 0.008 * field * 2.0 * np.sqrt(np.pi) * smooth_px  # brings the field back to unit variance
         plane = fit_plane(flat + noise.ravel()[:, None] * NORMAL, sigma_m=0.02)
-        assert plane is not None
         slopes.extend(along @ plane.normal / plane.sigma_tilt_rad)
         sigmas.append(plane.sigma_tilt_rad)
         rises.append(plane.height_m(centre[None])[0] / plane.sigma_offset_m)
@@ -99,12 +94,9 @@ def test_more_noise_and_a_farther_foot_are_less_sure(rng):
     points = plate(rng)
     jitter = rng.normal(size=(2000, 1)) * NORMAL
     quiet, loud = (fit_plane(points + s * jitter, sigma_m=0.02) for s in (0.001, 0.01))
-    assert quiet is not None
-    assert loud is not None
     assert quiet.sigma_tilt_rad <= loud.sigma_tilt_rad
     assert quiet.sigma_offset_m < loud.sigma_offset_m
     away = fit_plane(points + 0.01 * jitter, sigma_m=0.02, foot_m=points.mean(axis=0) + np.array([1.0, 0.0, 0.0]))
-    assert away is not None
     assert away.sigma_offset_m > loud.sigma_offset_m
 
 

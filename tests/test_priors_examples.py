@@ -172,8 +172,6 @@ def test_the_common_axis_is_as_sure_as_it_is_right() -> None:
     squares = []
     for seed in range(60):
         axis = common_axis([edge.posterior.pose for edge in edges(HERE, 6, seed=seed)], 1e-5, 1e-6)
-        assert axis is not None
-        assert axis.point_m is not None
         direction = axis.direction * np.sign(axis.direction @ NORMAL)
         off_rad = np.linalg.norm(np.cross(direction, NORMAL))
         # Where the true axis passes the plane across it at the point found.
@@ -188,7 +186,6 @@ def test_the_common_axis_leaves_a_wrong_pair_out() -> None:
     good = [edge.posterior.pose for edge in edges(HERE, 6)]
     wrong = replace(good[3], mean=turned(0.7, np.array([1.0, 0.0, 0.0])) @ good[3].mean)
     axis = common_axis([*good[:3], wrong, *good[4:]], 1e-3, 1e-4)
-    assert axis is not None
     assert np.degrees(np.linalg.norm(np.cross(axis.direction, NORMAL))) < 1.5
 
 
@@ -318,7 +315,6 @@ def test_a_hand_that_takes_the_object_anew_tells_nothing_of_its_motion(steps: fl
 
 def test_a_new_grasp_may_turn_the_object_in_any_way_where_limits_are_assumed() -> None:
     unlimited = held(HERE).unlimited()
-    assert unlimited is not None
     over = turned(np.radians(170.0))[None]
     assert unlimited.between(SOURCE, TARGET).log_prior(over) > -10.0
     assert held(HERE).between(SOURCE, TARGET).log_prior(over) < -100.0
@@ -510,11 +506,9 @@ def test_priors_that_contradict_each_other_are_refused() -> None:
 def test_a_product_leaves_the_limits_that_either_part_assumed() -> None:
     table, grip = TablePrior(limits_assumed=True), held(HERE)
     either = ProductPrior(grip, table).unlimited()
-    assert either is not None
     assert either.second == table.unlimited()
     assert either.first == grip.unlimited()
     one = ProductPrior(TablePrior(), GeneralPrior(limits_assumed=True)).unlimited()
-    assert one is not None
     assert one.first == TablePrior()
     assert ProductPrior(TablePrior(), GeneralPrior()).unlimited() is None
 

@@ -37,7 +37,6 @@ def plane_frame(sigma_inverse_per_m: float, width_px: float, *, bend: float = 0.
 @pytest.mark.parametrize("width_px", [0.0, 1.0, 3.0])
 def test_the_correlated_area_is_found_whatever_the_strength(sigma_inverse_per_m: float, width_px: float) -> None:
     noise = range_noise([(plane_frame(sigma_inverse_per_m, width_px, index=k), MASK) for k in range(4)])
-    assert noise is not None
     # Of a Gaussian mean of width s the autocorrelation is one of width √2 s. Wide errors pass for the plane's in part.
     expected_px = max(4.0 * np.pi * width_px**2, 1.0)
     assert noise.area_px == pytest.approx(expected_px, abs=0.5, rel=0.1 if width_px < 3.0 else 0.35)
@@ -55,8 +54,6 @@ def test_errors_that_averaging_removes_do_not_hide_smooth_ones() -> None:
         errors = np.random.default_rng([frame.index, 1]).normal(0.0, 1e-3, frame.depth_m.shape)  # as strong
         rough.append(replace(frame, depth_m=(1.0 / (1.0 / frame.depth_m + errors)).astype(np.float32)))
     alone, both = (range_noise([(frame, MASK) for frame in frames]) for frames in (smooth, rough))
-    assert alone is not None
-    assert both is not None
     assert both.area_px == pytest.approx(alone.area_px, rel=0.15)
 
 
@@ -65,7 +62,6 @@ def test_edges_and_the_object_do_not_count() -> None:
     depth_m = frame.depth_m.copy()
     depth_m[:, 300:] += 0.4  # a step
     noise = range_noise([(Frame(0, 0.0, depth_m, CAMERA, MASK), MASK)])
-    assert noise is not None
     assert noise.area_px == pytest.approx(1.0, abs=0.1)
     assert noise.pattern_share is None  # one frame cannot tell
 
@@ -87,14 +83,12 @@ def test_the_share_that_stays_from_frame_to_frame_is_found(share: float, width_p
         inverse = np.sqrt(1.0 - share) / plane_frame(1e-3, width_px, index=k).depth_m + np.sqrt(share) / fixed.depth_m
         frames.append(Frame(k, float(k), (1.0 / inverse).astype(np.float32), CAMERA, MASK))
     noise = range_noise([(frame, MASK) for frame in frames])
-    assert noise is not None
     assert noise.pattern_share == pytest.approx(share, abs=0.05)
 
 
 def test_a_scene_tells_the_sensor() -> None:
     scene = Segmenter().scene([plane_frame(2e-3, 2.0, index=k) for k in range(3)])
     noise = scene.range_noise
-    assert noise is not None
     assert noise.pattern_share is not None
     assert Sensor(SensorNoise(0.001, 0.0007)).measured(noise) == Sensor(
         SensorNoise(0.001, 0.0007),

@@ -79,7 +79,6 @@ def test_exact_depth_is_that_of_the_box() -> None:
     for index, pose in sequence.truth().items():
         frame = sequence.frame(index)
         expected_m = box_depth_m(frame.camera, se3.inverse(pose), np.array(size_m))
-        assert frame.mask is not None
         both = frame.mask & np.isfinite(expected_m)
         assert np.sum(frame.mask != np.isfinite(expected_m)) <= 3  # rays that graze an edge
         assert both.sum() > 300
@@ -91,7 +90,6 @@ def test_exact_depth_is_that_of_table_and_wall() -> None:
     recipe = Recipe(Sphere(0.03), view=SMALL, table=Table((0.4, 0.4)), wall=Wall(0.5), sensor=None)
     sequence = RenderedSequence(recipe)
     frame = sequence.frame(0)
-    assert frame.mask is not None
     around = ~frame.mask & np.isfinite(frame.depth_m)
     seen = se3.transform(se3.inverse(recipe.view.camera_from_table()), points_m(frame, around))
     on_wall, on_table = np.abs(seen[:, 1] - 0.5) < 1e-5, np.abs(seen[:, 2]) < 1e-5
@@ -216,10 +214,7 @@ def test_colour_follows_the_object() -> None:
     )
     sequence, truth = RenderedSequence(recipe), RenderedSequence(recipe).truth()
     first, second = sequence.frame(0), sequence.frame(1)
-    assert first.colour is not None
-    assert second.colour is not None
     assert first.mask is not None
-    assert second.mask is not None
     assert (first.colour[first.mask][:, 0] > first.colour[first.mask][:, 2]).all()  # reddish
     carried = se3.transform(truth[1] @ se3.inverse(truth[0]), points_m(first, first.mask))
     u = np.rint(second.camera.fx * carried[:, 0] / carried[:, 2] + second.camera.cx).astype(int)
@@ -237,14 +232,12 @@ def test_what_is_rendered_is_what_is_read(tmp_path: Path) -> None:
     assert (read.name, read.indices, read.motion) == (rendered.name, rendered.indices, rendered.motion)
     assert read.sensor() == rendered.sensor()
     read_truth = read.truth()
-    assert read_truth is not None
     for a, b in zip(read, rendered, strict=True):
         np.testing.assert_allclose(a.depth_m, b.depth_m, atol=0.5e-4 + 1e-6)
         np.testing.assert_array_equal(a.mask, b.mask)  # type: ignore[arg-type]
         np.testing.assert_array_equal(a.colour, b.colour)  # type: ignore[arg-type]
         assert (a.time_s, a.camera) == (b.time_s, b.camera)
         np.testing.assert_allclose(read_truth[a.index], rendered.truth()[a.index], atol=1e-12)
-    assert read.robot_path is not None
     lines = [line.split() for line in read.robot_path.read_text().splitlines() if not line.startswith("#")]
     assert [float(line[0]) for line in lines] == [frame.time_s for frame in rendered]
     shifts_m = np.array([[float(value) for value in line[1:4]] for line in lines])
@@ -271,7 +264,6 @@ def test_bundled_sequences_are_what_their_recipes_render(name: str) -> None:
     sequence, rendered = open_sequence(bundled(name)), RenderedSequence(load_recipe(name))
     assert len(sequence) == 14
     truth = sequence.truth()
-    assert truth is not None
     for index, pose in rendered.truth().items():
         np.testing.assert_allclose(truth[index], pose, atol=1e-9)
     stored, fresh = sequence.frame(6), rendered.frame(6)
@@ -290,10 +282,8 @@ def test_bundled_sequences_are_small_and_complete() -> None:
         sequence = open_sequence(folder)
         assert sequence.model_path is not None
         motion: Mapping[str, object] | None = sequence.motion
-        assert motion is not None
         assert motion["kind"] == "table"
         truth = sequence.truth()
-        assert truth is not None
         turned_deg = [
             np.degrees(float(se3.rotation_angle(truth[i + 1] @ se3.inverse(truth[i])))) for i in sequence.indices[:-1]
         ]

@@ -225,7 +225,6 @@ def test_the_mask_of_every_frame_is_shown(run: Path, page: str) -> None:
         shown = np.asarray(Image.open(io.BytesIO(picture)), dtype=float)
         line = (shown[..., 1] > shown[..., 0] + 40.0) & (shown[..., 1] > shown[..., 2] + 40.0)
         inside = ndimage.binary_fill_holes(line)
-        assert inside is not None
         (blob,) = rows[entities.MASK][frame]["blob"]
         mask = Image.open(io.BytesIO(bytes(blob.as_py()[0] if isinstance(blob.as_py()[0], list) else blob.as_py())))
         left, top, right, bottom = mask.convert("L").getbbox() or (0, 0, 0, 0)

@@ -26,7 +26,6 @@ def scaled_noise(scale: float) -> DepthNoise:
 def built() -> dict[float, list[Step]]:
     sequence = open_sequence(bundled("box"))
     noise = sequence.sensor()
-    assert noise is not None
     frames = [sequence.frame(index) for index in sequence.indices[:4]]
     runs = {}
     for scale in (1.0, *SCALES):
@@ -42,8 +41,6 @@ def test_a_model_is_built_alike_at_every_scale(built: dict[float, list[Step]], s
     assert [(edge.source, edge.target, edge.kind, edge.accepted) for edge in one.edges_so_far] == [
         (edge.source, edge.target, edge.kind, edge.accepted) for edge in other.edges_so_far
     ]
-    assert one.verdict is not None
-    assert other.verdict is not None
     assert one.verdict.codes == other.verdict.codes
     assert other.verdict.tolerance_m == pytest.approx(scale * one.verdict.tolerance_m, rel=1e-6)
     units = np.array([1.0, 1.0, 1.0, scale, scale, scale])

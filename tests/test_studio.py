@@ -67,7 +67,6 @@ def test_a_stroke_corrects_one_frame_and_the_build_reads_all_masks(scan: Scan, s
     before = {k: scan.mask(k) for k in scan.sequence.indices}
     scan.paint(1, [(5.0, 5.0), (40.0, 5.0)], 3.0, add=True)
     corrected = scan.mask(1)
-    assert corrected is not None
     assert corrected[5, 20]
     job, page = scan.build_jobs()
     written = Path(job.words[1])
@@ -194,7 +193,6 @@ def test_a_command_that_fails_says_why_and_what_depends_on_it_is_not_begun(tmp_p
     queue = Queue(tmp_path / "jobs.json")
     queue.add([Job(("info", str(missing)), tmp_path / "a.log", "A"), Job(("info", "x"), tmp_path / "b.log", "B")])
     finish(queue)
-    assert queue.last is not None
     assert queue.last.failure is not None
     assert str(missing) in queue.last.failure
     assert (queue.waiting, queue.current) == ([], None)
@@ -213,8 +211,6 @@ def test_a_server_takes_over_the_command_that_one_before_it_has_started(tmp_path
     queue = Queue(tmp_path / "jobs.json")
     queue.add([Job(("info", str(scene)), tmp_path / "a.log", "A"), Job(("info", str(scene)), tmp_path / "b.log", "B")])
     after = Queue(tmp_path / "jobs.json")
-    assert after.current is not None
-    assert queue.current is not None
     assert after.current.pid == queue.current.pid
     assert after.current.running
     assert [job.title for job in after.waiting] == ["B"]
@@ -253,7 +249,6 @@ def test_a_folder_that_is_being_written_is_followed_and_built_though_it_stalls(t
     studio = Studio(tmp_path / "studio")
     studio.queue.add(studio.watch(folder, "table", None))
     capture = studio.capture
-    assert capture is not None
     assert capture.job.line.startswith(f"modeler build {folder} --watch")
     assert (capture.count, capture.said(), capture.facts()) == (0, (None, ""), [])
     for number, name in enumerate(frames):
@@ -274,7 +269,6 @@ def test_a_folder_that_is_being_written_is_followed_and_built_though_it_stalls(t
     capture.stop()
     scan = studio.open(folder)
     report = scan.report()
-    assert report is not None
     assert len(report["poses"]) == 4
     assert report["prior"] == "table"
 

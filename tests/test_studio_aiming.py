@@ -78,7 +78,6 @@ def test_the_turn_is_read_from_what_a_build_says(words: str, turn_deg: float | N
 def test_the_next_view_covers_its_outline() -> None:
     sequence = open_sequence(BOX)
     truth, indices = sequence.truth(), sequence.indices
-    assert truth is not None
     frames = [sequence.frame(index) for index in indices]
     scene = Segmenter().scene([replace(frame, mask=None) for frame in frames])
     masks = {frame.index: Segmenter().segment(frame, scene).mask for frame in frames}

@@ -78,7 +78,6 @@ def test_poses_may_come_as_a_table(tmp_path: Path) -> None:
     path.write_text("name,cost,tx,ty,tz,qx,qy,qz,qw\nleft,2,0.1,0,0,0,0,0,1\n,1,0,0,0,0,0.7071068,0,0.7071068\n")
     left, second = read_candidates(path)
     assert (left.name, left.cost, second.name) == ("left", 2.0, "line 3")
-    assert left.new_from_last is not None
     assert [row[3] for row in left.new_from_last] == [0.1, 0.0, 0.0, 1.0]
 
 

@@ -138,8 +138,6 @@ def test_new_surface_grows_with_the_turn_and_the_pose_gets_less_certain(box: Bel
     shares = [each.new_surface for each in found if each is not None]
     assert shares == sorted(shares)
     assert shares[2] > shares[0] + 0.2
-    assert found[0] is not None
-    assert found[2] is not None
     assert found[0].pose_deg < found[2].pose_deg
     assert found[2].right <= found[0].right
 
@@ -165,7 +163,6 @@ def can() -> Belief:
 
 def mass_within(found: Prediction | None, turn_deg: float) -> float:
     """Return the probability that a view is placed within so much of where it belongs."""
-    assert found is not None
     edge = found.edges[0]
     return float(edge.masses[np.abs(TURNS_RAD) <= np.radians(turn_deg)].sum())
 
@@ -180,7 +177,6 @@ def test_colours_that_determined_the_spin_are_expected_to_do_so_again() -> None:
     turn = Candidate("turn", turn_deg=25.0)
     plain, printed = shown("can+plain", [0.0, 25.0], colour=True), shown("can+labelled", [0.0, 25.0], colour=True)
     assert shown("can+labelled", [0.0]).predictor.colour is None
-    assert printed.predictor.colour is not None
     assert (printed.predictor.colour.losses <= 0.0).all()
     assert spin_deg(printed.predict(turn)) < 0.5 * spin_deg(plain.predict(turn))
     assert mass_within(printed.predict(turn), 10.0) > mass_within(plain.predict(turn), 10.0)
@@ -188,7 +184,6 @@ def test_colours_that_determined_the_spin_are_expected_to_do_so_again() -> None:
 
 def test_a_view_that_may_be_placed_anywhere_is_expected_to_show_less_new_surface(can: Belief) -> None:
     found = can.predict(Candidate("turn", turn_deg=60.0))
-    assert found is not None
     object_from_new = can.object_from_last @ se3.inverse(
         found.candidate.motion(can.last, can.stand, can.object_from_last)
     )
@@ -214,7 +209,6 @@ def test_surface_seen_counts_once_and_hidden_space_less_the_farther_out_it_is(bo
 
 def test_laying_it_down_shows_what_it_stood_on_with_the_odds_of_joining(box: Belief) -> None:
     found = box.predict(Candidate("lay"))
-    assert found is not None
     assert found.new_surface > 0.0
     assert found.pose_nats == 0.0
     assert 0.5 < found.right < 1.0
@@ -229,15 +223,12 @@ def test_back_at_a_view_whose_spin_was_lost_a_turn_tells_of_the_poses() -> None:
     belief = shown("l_bracket", [0.0, 40.0, 80.0, 120.0], spin_sd_deg=6.0)
     back = belief.predict(Candidate("turn", turn_deg=-100.0))
     on = belief.predict(Candidate("turn", turn_deg=40.0))
-    assert back is not None
-    assert on is not None
     assert back.pose_nats > on.pose_nats + 1.0
     assert {found.target for found in back.edges} & {0, 1}
 
 
 def spin_deg(found: Prediction | None) -> float:
     """Return the standard deviation of the rotation between the new view and the last, which spin dominates."""
-    assert found is not None
     return float(np.degrees(np.sqrt(found.edges[0].covariance[:3, :3].trace())))
 
 

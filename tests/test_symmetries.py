@@ -163,7 +163,6 @@ def test_colour_breaks_the_symmetries_of_a_shape_that_it_tells_apart() -> None:
         result = SymmetryFinder().find(vertices, triangles, up=up, sigma_m=SIGMA_M, colours=colours, closed=True)
         assert (len(result.discrete), len(result.continuous)) == (3, 0)
         left = result.with_colour
-        assert left is not None
         assert (len(left.discrete), len(left.continuous)) == ((3, 0) if kept else (0, 0))
         assert ("with colour: none" in result.words) != kept
 
@@ -180,7 +179,6 @@ def test_of_an_axis_that_colour_breaks_the_turns_that_it_leaves_are_found() -> N
     up = np.array([0.0, 0.0, 1.0])
     result = SymmetryFinder().find(vertices, triangles, up=up, sigma_m=SIGMA_M, colours=colours, closed=True)
     assert len(result.continuous) == 1
-    assert result.with_colour is not None
     assert result.with_colour.continuous == ()
     about_up = [pose for pose in result.with_colour.discrete if abs(pose[2, 2] - 1.0) < 0.01]
     assert len(about_up) == 3

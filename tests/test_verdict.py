@@ -121,25 +121,21 @@ def test_other_frames_see_through_what_is_in_the_wrong_place() -> None:
     angles_deg = [25.0 * k for k in range(6)]
     views = views_of(angles_deg)
     found = free_space(views, poses_of(angles_deg), 0.005)
-    assert found is not None
     assert found.violations.holds
     assert found.violations.value < 0.01
     assert found.false_surface.holds
     assert found.false_surface.value == 0.0
     wrong = free_space(views, poses_of([*angles_deg[:5], 125.0 - 60.0]), 0.005)
-    assert wrong is not None
     assert wrong.frame == 5
     assert not wrong.violations.holds
     assert 5 in wrong.contradictions
     found = wrong.contradictions[5]
     mask = views[5].frame.mask
-    assert mask is not None
     assert mask[tuple(found.surface[:, :2].T.astype(int))].all()
     assert (found.surface[:, 2] >= 1).all()
     assert len(found.free) == len(np.unique(found.free, axis=0)) > 0
     assert free_space({0: views[0]}, poses_of([0.0]), 0.005) is None  # nobody else looks
     after = free_space(views, poses_of([*angles_deg[:3], *(angle_deg - 60.0 for angle_deg in angles_deg[3:])]), 0.005)
-    assert after is not None
     assert after.excess > 1.0 > wrong.excess / after.excess
     assert after.most_contradicted({frame: frame for frame in views}) == (2, 3)
     assert after.most_contradicted({frame: -frame for frame in views}) == (3, 2)
@@ -151,7 +147,6 @@ def test_a_part_that_one_frame_alone_shows_is_not_there() -> None:
     views, poses = views_of(angles_deg), poses_of(angles_deg)
     longer = seen(2, turned(angles_deg[2]), axes_m=AXES_M * np.array([1.0, 1.3, 1.0]))
     found = free_space(views | {2: longer}, poses, 0.005)
-    assert found is not None
     assert found.contradicted_frame == 2
     assert not found.false_surface.holds
     assert set(found.contradictions) == {2}
@@ -175,8 +170,6 @@ def test_a_size_that_is_open_by_more_than_5_mm_is_not_to_be_trusted(sigma: float
 def test_surface_that_never_moved_more_than_noise_shows_no_motion() -> None:
     views = views_of(STEPS_DEG)
     moved, stayed = (displacement(views, Solution(poses_of(angles))) for angles in (STEPS_DEG, [0.0, 0.3, 0.1, 0.4]))
-    assert moved is not None
-    assert stayed is not None
     assert (moved.holds, stayed.holds) == (True, False)
     assert displacement(views, Solution({0: np.eye(4)})) is None
 
@@ -213,7 +206,6 @@ def test_pairs_are_compared_with_their_prior(prior: AbstractPrior, found_deg: fl
     views = views_of([0.0, -found_deg], plane=TABLE if isinstance(prior, TablePrior) else None)
     poses = poses_of([0.0, -found_deg])  # turned left-handed about y, which points down: right-handed about up
     against = contradiction(prior_distances([joined(1, 0, poses)], views, prior))
-    assert against is not None
     assert against.check.holds is not contradicted
     assert (against.source, against.target) == (1, 0)
 
@@ -231,8 +223,6 @@ def test_one_new_grasp_contradicts_no_hand_and_one_at_every_step_does(changes: i
         [joined(k, k - 1, poses) for k in range(1, 13)], views, HeldPrior(HandPoses(np.arange(13.0), np.stack(hands)))
     )
     against, check = contradiction(distances), prior_check(distances)
-    assert against is not None
-    assert check is not None
     assert against.check.holds
     assert check.holds is together
 
@@ -245,7 +235,6 @@ def test_a_tilted_object_contradicts_its_table() -> None:
     for motion, holds in ((right, True), (tilt @ right, False)):
         poses = {0: np.eye(4), 1: se3.inverse(motion)}
         against = contradiction(prior_distances([joined(1, 0, poses)], views, TablePrior()))
-        assert against is not None
         assert against.check.holds is holds
 
 
@@ -265,7 +254,6 @@ def test_a_rotation_that_a_pair_leaves_open_contradicts_no_steps_that_the_graph_
     anywhere = joined(2, 0, poses_of([0.0, 0.0, -20.0]), kind="span")
     for solution, holds in ((None, False), (Solution(poses), True), (Solution(poses_of([0.0, 0.0, -20.0])), False)):
         against = contradiction(prior_distances([anywhere], views, TurntablePrior(25.0), solution=solution))
-        assert against is not None
         assert against.check.holds is holds
 
 
@@ -276,8 +264,6 @@ def test_a_step_given_wrongly_shows_in_all_pairs_together(step_deg: float, alone
     edges = [joined(k, k - 1, poses) for k in range(1, 13)]
     distances = prior_distances(edges, views, TurntablePrior(25.0))
     against, check = contradiction(distances), prior_check(distances)
-    assert against is not None
-    assert check is not None
     assert against.check.holds is alone
     assert check.holds is together
     assert prior_check(prior_distances([joined(5, 1, poses, kind="closure")], views, TurntablePrior(25.0))) is None
@@ -310,7 +296,6 @@ def test_a_loop_open_by_less_than_makes_a_pose_wrong_is_closed_however_precise_i
         sure = [replace(error, sigmas=10.0) for error in loop_closure_errors(edges, solution, {})]
         far = [replace(error, translation_m=0.005) for error in sure]
         worst = loop_check(far, tolerance_m)
-        assert worst is not None
         assert worst[1].holds is holds
 
 
@@ -318,8 +303,6 @@ def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
     edges, solution = ring(2.0)
     errors = loop_closure_errors(edges, solution, {})
     one, many = loop_check(errors), loop_check(errors * 50)
-    assert one is not None
-    assert many is not None
     assert one[1].limit == pytest.approx(np.sqrt(22.458 / 6.0), rel=1e-3)  # χ² of 6 degrees of freedom, 0.001
     assert many[1].limit > one[1].limit
 
@@ -327,24 +310,20 @@ def test_each_of_many_loops_may_be_open_a_little_farther() -> None:
 def test_edges_that_contradict_each_other_speak_against_a_model() -> None:
     edges, solution = ring(0.0)
     check = graph_check(edges, solution)
-    assert check is not None
     assert check.holds
     wrong = poses_of([0.0, 20.0])[1]
     spoilt = replace(edges[3].posterior, pose=replace(edges[3].posterior.pose, mean=wrong))
     spoilt_edges = [*edges[:3], replace(edges[3], posterior=spoilt), *edges[4:]]
     check = graph_check(spoilt_edges, solution)
-    assert check is not None
     assert not check.holds
     assert misfit(spoilt_edges, solution) == pytest.approx(np.sqrt(check.value))
     views = views_of([360.0 * k / 14.0 for k in range(15)])
     check = graph_check(spoilt_edges, solution, views, tolerance_m=1.0)
-    assert check is not None
     assert not check.holds  # 6° off
     nearly = replace(edges[3].posterior, pose=replace(edges[3].posterior.pose, mean=poses_of([0.0, 24.0])[1]))
     nearly_edges = [*edges[:3], replace(edges[3], posterior=nearly), *edges[4:]]
     for seen_in, tolerance_m, holds in ((None, 0.0, False), (views, 0.001, False), (views, 0.005, True)):
         check = graph_check(nearly_edges, solution, seen_in, tolerance_m)
-        assert check is not None
         assert check.holds is holds  # 1.7° off, within what is called right
     assert misfit(edges, solution) >= 1.0
     assert graph_check(edges[:-1], solution) is None  # a tree contradicts nothing
@@ -379,15 +358,12 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
         spread_from_first = AboutMean.of(solution)  # no joint covariance is known
         turn = spread_of_rotations(spread_from_first)
         place = spread_of_positions(views, solution, spread_from_first, 0.005)
-        assert turn is not None
-        assert place is not None
         assert (turn.frame, turn.check.holds) == (2, turn_holds)
         assert (place.frame, place.check.holds) == (2, place_holds)
         assert place.check.value == pytest.approx(np.hypot(sigma_m, 0.0005), rel=0.02)
         drawn_deg = np.abs(turn.check.value * rng.normal(size=20_000))
         assert bool(np.mean(drawn_deg > 3.0) < 0.05) is turn_holds
     wider = spread_of_rotations(spread_from_first, 2.0)
-    assert wider is not None
     assert 1.9 < wider.check.value / turn.check.value < 2.2
     assert spread_of_rotations(AboutMean.of(Solution())) is None
     assert spread_of_positions(views, Solution(), AboutMean(), 0.005) is None

@@ -74,8 +74,6 @@ def test_a_run_with_its_views_on_disk_has_the_same_result() -> None:
     assert all(on_disk(view) for view in other.views.values())
     for frame, pose in one.solution.trajectory.items():
         np.testing.assert_array_equal(other.solution.trajectory[frame], pose)
-    assert one.model is not None
-    assert other.model is not None
     np.testing.assert_array_equal(one.model.vertices_m, other.model.vertices_m)
 
 

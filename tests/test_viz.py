@@ -144,7 +144,6 @@ def test_images_survive_compression(run: list[Step], recording: Recording) -> No
         assert near < np.median(of_object) < far
         mask = np.array(recording[entities.MASK][index]["buffer"][0], dtype=bool).reshape(frame.depth_m.shape)
         np.testing.assert_array_equal(mask, step.segmentation.mask)
-        assert frame.colour is not None
         luma = np.array([0.299, 0.587, 0.114])  # JPEG keeps colour at half the resolution
         difference = (decoded(recording[entities.COLOUR][index]["blob"]).astype(float) - frame.colour) @ luma
         assert np.abs(difference).mean() < 5.0
@@ -164,13 +163,11 @@ def test_large_images_are_shown_smaller(run: list[Step]) -> None:
     step = replace(run[0], frame=frame, segmentation=replace(run[0].segmentation, mask=depth_m > 0.0))
     (depth,) = [archetype for path, archetype in images.draw_frame(step) if path == entities.DEPTH]
     assert isinstance(depth, rr.EncodedDepthImage)
-    assert depth.blob is not None
     assert decoded(depth.blob.as_arrow_array().to_pylist()).shape == (240, 320)
     coloured = replace(step, frame=replace(frame, colour=np.zeros((960, 1280, 3), dtype=np.uint8)))
     for shown, size in ((step, 240 * 320), (coloured, 480 * 640)):  # laid over the depth, or over the colours
         (mask,) = [archetype for path, archetype in images.draw_frame(shown) if path == entities.MASK]
         assert isinstance(mask, rr.SegmentationImage)
-        assert mask.buffer is not None
         assert len(mask.buffer.as_arrow_array().to_pylist()[0]) == size
 
 
@@ -386,7 +383,6 @@ def test_the_model_grows_and_ends_as_a_mesh(run: list[Step], recording: Recordin
     assert sorted(sizes) == list(range(COUNT - 1))
     assert sizes[COUNT - 2] > sizes[0]
     mesh = recording[entities.MESH][COUNT - 1]
-    assert run[-1].model is not None
     np.testing.assert_allclose(mesh["vertex_positions"], run[-1].model.vertices_m, atol=1e-6)
     np.testing.assert_array_equal(mesh["triangle_indices"], run[-1].model.triangles)
 

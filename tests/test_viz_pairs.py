@@ -58,7 +58,6 @@ def test_the_ends_of_the_axes_gather_about_the_mean(recording: Recording, run: l
 
 def test_the_visibility_picture_has_the_three_areas(run: list[Step], recording: Recording) -> None:
     target = run[0].view
-    assert target is not None
     shape = target.frame.depth_m.shape
     areas = np.array(recording[entities.VISIBILITY_AREAS][1]["buffer"][0], dtype=np.uint8).reshape(shape)
     assert target.frame.mask is not None
@@ -105,7 +104,6 @@ def test_points_are_drawn_by_what_is_said_of_them(run: list[Step]) -> None:
     ):
         points = drawn_at(offset_m)[path]
         assert isinstance(points, rr.Points2D)
-        assert points.positions is not None
         assert len(points.positions.as_arrow_array()) > 100
 
 
@@ -165,7 +163,6 @@ def test_readings_are_those_of_the_posterior(run: list[Step], recording: Recordi
     samples = np.random.default_rng(0).multivariate_normal(np.zeros(6), posterior.pose.covariance, 50_000)
     turned = np.linalg.eigvalsh(np.cov(samples[:, :3].T))[-1] ** 0.5
     assert values[entities.ROTATION_SD] == pytest.approx(np.rad2deg(turned), rel=0.02)
-    assert run[1].view is not None
     centre = np.append(run[1].view.centroid_m, 1.0)
     shifted = np.linalg.eigvalsh(np.cov((se3.exp(samples) @ centre)[:, :3].T))[-1] ** 0.5
     assert values[entities.TRANSLATION_SD] == pytest.approx(1000 * shifted, rel=0.02)
@@ -189,7 +186,6 @@ def test_the_last_words_tell_by_how_much_the_loop_was_open(run: list[Step], reco
     last = run[-1]
     centroids_m = {frame: view.centroid_m for frame, view in last.views.items()}
     error = loop_closure_error(last.edges_so_far, last.solution, centroids_m)
-    assert error is not None
     words = f"{np.degrees(error.rotation_rad):.1f}° and {1000.0 * error.translation_m:.1f} mm"
     assert f"has a closure error of {words}" in recording[entities.NOW][last.frame.index]["text"][0]
 

@@ -358,7 +358,6 @@ def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp
         "print(served.process.pid, flush=True); served.wait()"
     )
     with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
-        assert command.stdout is not None
         server = int(command.stdout.readline())
         time.sleep(0.2)  # from the line to the wait
         command.send_signal(number)
@@ -375,7 +374,6 @@ def test_the_server_ends_with_its_parent_however_that_ends(run: list[Step], tmp_
         "print(viewer.view(pathlib.Path(sys.argv[1]), web=True).process.pid, flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
-        assert command.stdout is not None
         server = int(command.stdout.readline())
         assert b"rerun" in Path(f"/proc/{server}/cmdline").read_bytes()
         command.kill()
@@ -431,7 +429,6 @@ def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_pat
     arguments = [sys.executable, "-c", program, str(tmp_path / "r.rrd")]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, env=environment) as command:
-        assert command.stdout is not None
         server = int(command.stdout.readline())
         command.terminate()
         assert command.wait(timeout=20.0) == 128 + signal.SIGTERM
