@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import re
 import resource
+import subprocess
+import sys
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -46,6 +50,32 @@ def runner(capfd: pytest.CaptureFixture[str]) -> Run:
         return Ended(status, str(said.out), str(said.err))
 
     return run
+
+
+def refusal_of(ended: Ended) -> str:
+    """Return the line with which a command refused what it was given: status 2, and nothing on stdout."""
+    assert (ended.status, ended.out) == (2, "")
+    assert re.fullmatch(r"modeler: .+\n", ended.err)
+    return ended.err
+
+
+def spawned(*arguments: object, shell: str = "exec", after: str = "", settings: Any = None, **how: Any) -> Ended:
+    """Run a command in a process of its own.
+
+    Args:
+        arguments: of `modeler`; or of Python, where they begin with `-`.
+        shell: words before the command, such as `ulimit -n 8; exec`.
+        after: words behind it, such as `2>&-`.
+        settings: variables of the environment, beside those of this process.
+        how: further arguments of `subprocess.run`.
+    """
+    words = [] if str(arguments[0]).startswith("-") else ["-m", "modeler"]
+    command = [sys.executable, *words, *map(str, arguments)]
+    given = {"env": {**os.environ, **(settings or {})}, "timeout": 200.0} | how
+    ended = subprocess.run(
+        ["bash", "-c", f'{shell} "$@" {after}', "-", *command], capture_output=True, text=True, check=False, **given
+    )
+    return Ended(ended.returncode, ended.stdout, ended.stderr)
 
 
 def with_files_of_at_most(size: int, *arguments: str) -> int:

@@ -21,7 +21,7 @@ if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # as nohup starts what it
 
 import numpy as np
 import pytest
-from command_runner import QUICK, Run, runner
+from command_runner import QUICK, Run, refusal_of, runner
 from turning_box import COUNT, LOST, steps
 
 from modeler.cli import main
@@ -69,6 +69,12 @@ def _looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def cli(capfd: pytest.CaptureFixture[str]) -> Run:
     """Return what runs a command in this process, and tells how it ended and what it said."""
     return runner(capfd)
+
+
+@pytest.fixture
+def refusal(cli: Run) -> Callable[..., str]:
+    """Return what runs a command that must refuse what it is given, and returns the line that it says."""
+    return lambda *arguments: refusal_of(cli(*arguments))
 
 
 @pytest.fixture(scope="session")
