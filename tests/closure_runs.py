@@ -1,5 +1,7 @@
 """A loop whose registration knows the truth, to see what a closer asks for and how it judges."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -56,7 +58,8 @@ class Run:
         closer: Closer,
         spoil: Callable[[Posterior], Posterior] = lambda posterior: posterior,
         bias: Array | None = None,
-    ) -> None:
+    ) -> Run:
+        """Take in the frames one after the other, and return what that leaves."""
         rng = np.random.default_rng(0)
         bias_here = np.zeros(6) if bias is None else bias
         for source in self.numbers:
@@ -84,6 +87,7 @@ class Run:
             self.smoother = self.smoother.to(self.graph)
             if source in self.views and closer.is_keyframe(source, self.map_view):
                 self.keyframes = (*self.keyframes, source)
+        return self
 
     @property
     def solution(self) -> Solution:

@@ -12,18 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
-EXECUTABLE = Path("/usr/bin/chromium")
-FLAGS = (
-    "--no-sandbox",
-    "--disable-dev-shm-usage",
-    "--enable-unsafe-swiftshader",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--ignore-gpu-blocklist",
-)
-
 
 class Server:
     """A server that runs, and its address."""
@@ -83,6 +71,3 @@ def end(pid: int | None) -> None:
             os.kill(pid, signal.SIGKILL)
         except ProcessLookupError:
             return
-
-
-needs_browser = pytest.mark.skipif(not EXECUTABLE.exists(), reason="Chromium is not installed")

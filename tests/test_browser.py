@@ -12,10 +12,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import chromium
 import numpy as np
 import numpy.typing as npt
 import pytest
+from chromium import Page, needs_chromium, started
 from turning_box import object_from_camera, steps
 
 from modeler import se3
@@ -26,7 +26,7 @@ from modeler.viz import viewer
 from modeler.viz.report import write_page
 from modeler.viz.stream import open_stream
 
-pytestmark = pytest.mark.skipif(chromium.EXECUTABLE is None, reason="Chromium is not installed")
+pytestmark = needs_chromium
 COUNT = 4
 
 
@@ -43,9 +43,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def page(tmp_path: Path) -> Iterator[chromium.Page]:
-    with chromium.Page(tmp_path / "profile", 1600, 1000) as page:
-        yield page
+def page() -> Iterator[Page]:
+    with started() as browser:
+        yield Page(browser, 1600, 1000)
 
 
 def coloured(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
@@ -53,7 +53,7 @@ def coloured(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
     return np.ptp(picture.astype(int), axis=2) > 40
 
 
-def test_the_report_draws_the_model_and_turns_it(run: Path, page: chromium.Page) -> None:
+def test_the_report_draws_the_model_and_turns_it(run: Path, page: Page) -> None:
     page.open((run / "report.html").as_uri())
     page.wait_for("document.getElementById('mesh')?.dataset.drawn == '12'")
     page.value("document.getElementById('mesh').scrollIntoView()")
@@ -93,7 +93,7 @@ def test_the_report_draws_the_model_and_turns_it(run: Path, page: chromium.Page)
 
 
 @pytest.mark.slow
-def test_the_web_viewer_draws_the_run(run: Path, page: chromium.Page) -> None:
+def test_the_web_viewer_draws_the_run(run: Path, page: Page) -> None:
     served = viewer.view(run, web=True)
     try:
         page.open(f"{served.address}&renderer=webgl")
@@ -132,7 +132,7 @@ def site(tmp_path: Path) -> Iterator[tuple[Path, str]]:
 
 @pytest.mark.slow
 def test_a_viewer_in_the_browser_draws_an_exported_model_with_its_texture(
-    site: tuple[Path, str], tmp_path: Path, page: chromium.Page
+    site: tuple[Path, str], tmp_path: Path, page: Page
 ) -> None:
     folder, address = site
     assert main(["build", str(bundled("box")), "--prior", "table", "--out", str(tmp_path / "run")]) == 0

@@ -9,12 +9,13 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from command_runner import BOX, FILES, Run
+from command_runner import BOX, FILES, Run, refusal_of, spawned
 
 from modeler import priors, se3
 from modeler.baselines import fpfh
@@ -119,28 +120,15 @@ def report(folder: Path) -> dict:
     ],
 )
 def test_unusable_input_gives_status_2_and_one_line(
-    cli: Run, scene: Path, tmp_path: Path, arguments: tuple[str, ...], says: str
+    refusal: Callable[..., str], scene: Path, tmp_path: Path, arguments: tuple[str, ...], says: str
 ) -> None:
-    places = {name: tmp_path / name.lower() for name in ("OUT", "OUT.glb")} | {
-        "NOWHERE": tmp_path / "NOWHERE",
-        "SCENE": scene,
-    }
-    ended = cli(*(places.get(argument, argument) for argument in arguments))
-    assert (ended.status, ended.out) == (2, "")
-    assert re.fullmatch(r"modeler: .+\n", ended.err)
-    assert says in ended.err
+    places = {name: tmp_path / name for name in ("OUT", "OUT.glb", "NOWHERE")} | {"SCENE": scene}
+    assert says in refusal(*(places.get(argument, argument) for argument in arguments))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_console_script_ends_with_the_status() -> None:
-    ended = subprocess.run(
-        [sys.executable, "-m", "modeler", "view", "/nowhere"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.count("\n") == 1
+    refusal_of(spawned("view", "/nowhere"))
 
 
 @pytest.mark.parametrize("arguments", [(), ("build",)])
@@ -156,13 +144,12 @@ def test_a_reader_who_has_left_is_no_error(arguments: tuple[str, ...]) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 @pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("info", "SCENE")])
 def test_a_full_disk_under_stdout_is_reported_in_one_line(
-    cli: Run, scene: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+    refusal: Callable[..., str], scene: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
 ) -> None:
     with Path("/dev/full").open("w") as full:
         monkeypatch.setattr(sys, "stdout", full)
-        ended = cli(*(scene if argument == "SCENE" else argument for argument in arguments))
-    assert ended.status == 2
-    assert re.fullmatch(r"modeler: .*No space left on device.*\n", ended.err)
+        said = refusal(*(scene if argument == "SCENE" else argument for argument in arguments))
+    assert "No space left on device" in said
 
 
 def test_register_prints_one_edge_the_same_for_the_same_seed(cli: Run, scene: Path) -> None:
@@ -250,36 +237,30 @@ def test_a_run_that_loses_frames_ends_with_status_3_and_says_why(cli: Run, box: 
     assert not given["trustworthy"]
     assert given["complete"]
     assert [frame["outcome"].partition(":")[0] for frame in given["frames"]] == [Outcome.TOO_FEW_POINTS.label] * 3
-    (lost,) = (
-        reason for code, reason in zip(given["reason_codes"], given["reasons"], strict=True) if code == "left_out"
-    )
-    assert lost.startswith("frames 0 to 2 ")
+    reasons = dict(zip(given["reason_codes"], given["reasons"], strict=True))
+    assert reasons["left_out"].startswith("frames 0 to 2 ")
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"model.ply", "cloud.ply"}
 
 
 @pytest.mark.parametrize(
     "arguments", [("register", TUBE, 1, 0), ("build", TUBE), ("evaluate", TUBE, "--frames", "0:2", "--prior", "table")]
 )
-def test_coloured_icp_refuses_what_has_no_colour(cli: Run, tmp_path: Path, arguments: tuple[object, ...]) -> None:
+def test_coloured_icp_refuses_what_has_no_colour(
+    refusal: Callable[..., str], tmp_path: Path, arguments: tuple[object, ...]
+) -> None:
     named = ("--methods" if arguments[0] == "evaluate" else "--method", "coloured-icp")
     out = () if arguments[0] == "register" else ("--out", tmp_path / "out")
-    ended = cli(*arguments, *named, *out)
-    assert (ended.status, ended.out) == (2, "")
-    assert ended.err.count("\n") == 1
-    assert "has no colour" in ended.err
+    assert "has no colour" in refusal(*arguments, *named, *out)
     assert not (tmp_path / "out" / "report.json").exists()
 
 
 @pytest.mark.parametrize("arguments", [("register", TUBE, 1, 0), ("evaluate", TUBE, "--prior", "table")])
 def test_kiss_is_refused_where_it_is_not_installed(
-    cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...]
+    refusal: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...]
 ) -> None:
     monkeypatch.setattr(fpfh, "kiss_installed", lambda: False)
     named = ("--methods", "kiss", "--out", tmp_path / "out") if arguments[0] == "evaluate" else ("--method", "kiss")
-    ended = cli(*arguments, *named)
-    assert (ended.status, ended.out) == (2, "")
-    assert ended.err.count("\n") == 1
-    assert "-m pip install 'modeler[peers]'" in ended.err
+    assert "-m pip install 'modeler[peers]'" in refusal(*arguments, *named)
 
 
 def test_evaluate_writes_errors_and_prints_a_table(cli: Run, box: Path, tmp_path: Path) -> None:
@@ -397,16 +378,8 @@ def test_a_step_that_the_views_contradict_is_reported() -> None:
     unsure = [edge | {"modes": [{"weight": w, "weight_in_graph": w} for w in (0.8, 0.2)]} for edge in steps(15.0)]
     wide = np.diag(np.repeat([np.radians(8.0), 1e-3], 3) ** 2).ravel().tolist()
     uncertain = [edge | {"covariance": wide} for edge in steps(15.0)]
-    for edges in (
-        steps(25.0),
-        steps(90.0, gap=3),
-        steps(15.0, count=2),
-        [lost] * 5,
-        [],
-        both_senses,
-        unsure,
-        uncertain,
-    ):
+    few = steps(15.0, count=2)
+    for edges in (steps(25.0), steps(90.0, gap=3), few, [lost] * 5, [], both_senses, unsure, uncertain):
         assert measured_step(edges, prior) == ""
     assert measured_step(steps(15.0), priors.TablePrior()) == ""
     still = measured_step(steps(0.02), prior)

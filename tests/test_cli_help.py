@@ -6,11 +6,9 @@ import contextlib
 import dataclasses
 import io
 import re
-import subprocess
-import sys
 
 import pytest
-from command_runner import Run
+from command_runner import Run, spawned
 
 from modeler import priors
 from modeler.cli import main, parsed
@@ -47,8 +45,7 @@ def test_help_of_the_program_has_the_first_sentence_of_each_command_without_impo
     for name, told in SUMMARIES.items():
         assert " ".join((command_class(name).__doc__ or "").split("\n\n")[0].split()) == told
     script = "import atexit, sys; atexit.register(lambda: print('tyro' in sys.modules)); import modeler.cli as cli; "
-    ended = subprocess.run([sys.executable, "-c", f"{script} cli.main(['--help'])"], capture_output=True, check=False)
-    assert ended.stdout.endswith(b"False\n")
+    assert spawned("-c", f"{script} cli.main(['--help'])").out.endswith("False\n")
 
 
 def test_help_may_be_asked_for_in_a_word(cli: Run) -> None:
@@ -100,8 +97,8 @@ for command in {COMMANDS}:
         main([command, "--help"])
 sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
 """
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (0, "")
+    ended = spawned("-c", script)
+    assert (ended.status, ended.err) == (0, "")
 
 
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PriorOptions) if field.name != "prior"])

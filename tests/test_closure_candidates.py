@@ -25,8 +25,7 @@ SYSTEMATIC = ConsistencyModel().systematic(1, CENTROID_M)
 
 def chain(angles_deg: Sequence[float]) -> tuple[MapView, Run]:
     """Return what is known after frames at angles, each registered against the one before alone."""
-    run = Run(list(angles_deg))
-    run.run(Closer(max_closures=0))
+    run = Run(list(angles_deg)).run(Closer(max_closures=0))
     return run.map_view, run
 
 
@@ -86,22 +85,21 @@ def test_systematic_error_grows_with_the_length_of_the_path() -> None:
 
 def test_coming_back_depends_on_the_path_not_on_frame_numbers() -> None:
     """A frame that was lost hangs on a view far round; its number lies beside that of the first."""
-    run = Run([0.0, 0.0, *(40.0 * np.arange(1, 5))], [0, 1, 2, 3, 4, 5])
-    run.run(Closer(max_closures=0), lambda posterior: posterior)
+    run = Run([0.0, 0.0, *(40.0 * np.arange(1, 5))], [0, 1, 2, 3, 4, 5]).run(
+        Closer(max_closures=0), lambda posterior: posterior
+    )
     map_view = run.map_view
     assert map_view.came_back(0, 1, map_view.shortest_paths(5), away_deg=90.0)
     assert not map_view.came_back(0, 1, map_view.shortest_paths(1), away_deg=90.0)
 
 
 def test_closure_on_the_first_view_is_preferred() -> None:
-    run = Run(list(16.0 * np.arange(26)))
-    run.run(Closer(max_closures=1))
+    run = Run(list(16.0 * np.arange(26))).run(Closer(max_closures=1))
     assert [run.tried[frame][1:] for frame in range(20, 24) if len(run.tried[frame]) > 1] == [(0,), (0,)]
 
 
 def test_a_frame_has_one_span_at_most() -> None:
-    run = Run(list(2.0 * np.arange(45)))
-    run.run(Closer(max_closures=3, min_gain_nats=3.0))
+    run = Run(list(2.0 * np.arange(45))).run(Closer(max_closures=3, min_gain_nats=3.0))
     spans = [sum(edge.kind == "span" for edge in edges) for edges in run.judged.values()]
     assert max(spans) == 1
 
@@ -171,8 +169,7 @@ def test_the_least_variance_of_a_frame_is_that_of_its_best_edge() -> None:
 
 def test_a_network_that_grew_is_that_of_all_edges() -> None:
     """Also where an edge no longer takes part, or enters with another pose."""
-    run = Run(list(20.0 * np.arange(24)))
-    run.run(Closer())
+    run = Run(list(20.0 * np.arange(24))).run(Closer())
     edges, solution = run.graph.edges, run.solution
     closure = run.closures()[0]
     pose = PoseGaussian(closure.posterior.pose.mean, 0.5 * closure.posterior.pose.covariance)

@@ -19,8 +19,7 @@ TURNS = 8
 @pytest.fixture(scope="module")
 def turns() -> Run:
     """Return what eight turns at 15° a frame left, registered by the truth."""
-    run = Run(list(15.0 * np.arange(TURNS * A_TURN)))
-    run.run(Closer(keyframe_deg=KEYFRAME_DEG))
+    run = Run(list(15.0 * np.arange(TURNS * A_TURN))).run(Closer(keyframe_deg=KEYFRAME_DEG))
     return run
 
 

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import chromium
 import numpy as np
 import pytest
+from chromium import Page, needs_chromium, started
 from command_runner import Run
 from PIL import Image
 
@@ -23,7 +23,6 @@ from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.shapes import Box
 
 COUNT = 1000
-browser = pytest.mark.skipif(chromium.EXECUTABLE is None, reason="Chromium is not installed")
 
 
 def picture(number: int) -> bytes:
@@ -68,13 +67,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def page(tmp_path: Path) -> Iterator[chromium.Page]:
-    with chromium.Page(tmp_path / "profile", 1400, 1000) as page:
-        yield page
+def page() -> Iterator[Page]:
+    with started() as browser:
+        yield Page(browser, 1400, 1000)
 
 
-@browser
-def test_a_thousand_models_are_there_within_two_seconds(cli: Run, folder: Path, page: chromium.Page) -> None:
+@needs_chromium
+def test_a_thousand_models_are_there_within_two_seconds(cli: Run, folder: Path, page: Page) -> None:
     ended = cli("gallery", folder, "--overwrite")
     assert (ended.status, ended.out) == (0, "")
     assert {path.name for path in folder.iterdir() if path.is_file()} == {"gallery.html", "models.parquet"}
@@ -134,8 +133,8 @@ def test_runs_that_others_have_closed_are_named_and_left_out(cli: Run) -> None:
     assert "Permission denied" in alone.err
 
 
-@browser
-def test_models_are_sorted_and_filtered(cli: Run, folder: Path, page: chromium.Page) -> None:
+@needs_chromium
+def test_models_are_sorted_and_filtered(cli: Run, folder: Path, page: Page) -> None:
     assert cli("gallery", folder, "--overwrite").status == 0
     page.open((folder / "gallery.html").as_uri())
 

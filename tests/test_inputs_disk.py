@@ -6,14 +6,13 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from command_runner import QUICK, with_files_of_at_most
+from command_runner import QUICK, Run, refusal_of, spawned, with_files_of_at_most
 
 from modeler.cli import main
 from modeler.export import RunFolder
@@ -55,10 +54,10 @@ def test_a_recording_that_is_cut_off_is_said(scene: Path, tmp_path: Path) -> Non
     command = ["build", str(short), "--out", str(tmp_path / "run"), *QUICK, "--overwrite"]
     program = f"import sys, resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size})); import modeler.cli"
     program += "; sys.exit(modeler.cli.main(sys.argv[1:]))"
-    ended = subprocess.run([sys.executable, "-c", program, *command], capture_output=True, text=True, check=False)
-    assert ended.returncode == 0
+    ended = spawned("-c", program, *command)
+    assert ended.status == 0
     usual = ("modeler: 2 of 2 frames", "modeler: the model can be trusted")
-    said = [line for line in ended.stderr.splitlines() if not line.startswith(usual)]
+    said = [line for line in ended.err.splitlines() if not line.startswith(usual)]
     assert len(said) == 1
     assert "recording.rrd: " in said[0]
 
@@ -125,9 +124,7 @@ def test_that_a_run_is_closed_to_others_is_said(closed: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["build", "convert", "export", "evaluate", "poses"])
-def test_a_closed_folder_is_said(
-    scene: Path, built: Path, closed: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
+def test_a_closed_folder_is_said(scene: Path, built: Path, closed: Path, cli: Run, command: str) -> None:
     user = os.geteuid()
     os.seteuid(os.getuid())
     inputs = Path(tempfile.mkdtemp())  # pytest's own folders are closed to others
@@ -144,14 +141,12 @@ def test_a_closed_folder_is_said(
         "poses": ["convert", inputs / "run", "--out", closed / "poses.txt"],
     }
     os.seteuid(user)
-    status = main([str(word) for word in arguments[command]])
-    said = capsys.readouterr()
+    ended = cli(*arguments[command])
     os.seteuid(os.getuid())
     shutil.rmtree(inputs)
-    assert (status, said.out) == (2, "")
-    assert said.err.count("\n") == 1
-    assert "ermission denied" in said.err
-    assert str(closed) in said.err
+    said = refusal_of(ended)
+    assert "ermission denied" in said
+    assert str(closed) in said
     assert list(closed.iterdir()) == []
 
 
@@ -163,7 +158,3 @@ def test_what_a_killed_program_left_is_tidied_up(tmp_path: Path) -> None:
     write_bop(tmp_path / "scene", small_frames(1))
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"scene", f".scene.{os.getppid()}.partial", ".scene.other.partial"}
-
-
-def test_the_sequence_is_intact(scene: Path) -> None:
-    assert len(list(open_sequence(scene))) == 3

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_runner import Run
 from PIL import Image
 
 from modeler.cli import main
@@ -206,20 +207,14 @@ FAULTS: dict[str, dict[str, tuple[Damage, str]]] = {
 
 @pytest.mark.parametrize(("kind", "fault"), [(kind, fault) for kind, faults in FAULTS.items() for fault in faults])
 def test_every_fault_is_one_line_and_leaves_nothing(
-    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, fault: str
+    written: Path, tmp_path: Path, refusal: Callable[..., str], kind: str, fault: str
 ) -> None:
     folder = tmp_path / "in"
     shutil.copytree(written / kind, folder)
     damage, says = FAULTS[kind][fault]
     damage(folder)
     estimates = not fault.startswith("truth")  # which never looks at the ground truth
-    command = ["build", str(folder), "--out", str(tmp_path / "run")] if estimates else ["info", str(folder)]
-    status = main(command)
-    said = capsys.readouterr()
-    assert (status, said.out) == (2, "")
-    assert said.err.startswith("modeler: ")
-    assert said.err.count("\n") == 1
-    assert says in said.err
+    assert says in refusal(*(("build", folder, "--out", tmp_path / "run") if estimates else ("info", folder)))
     assert {path.name for path in tmp_path.iterdir()} <= {"in", "outside"}
 
 
@@ -248,7 +243,7 @@ def test_intact_sequences_are_read_with_strict_paths(written: Path, kind: str) -
 
 @pytest.mark.parametrize(("kind", "linked"), LINKS)
 def test_links_out_of_a_sequence_are_followed_unless_paths_are_strict(
-    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, linked: str
+    written: Path, tmp_path: Path, refusal: Callable[..., str], kind: str, linked: str
 ) -> None:
     folder = tmp_path / "in"
     shutil.copytree(written / kind, folder)
@@ -259,17 +254,10 @@ def test_links_out_of_a_sequence_are_followed_unless_paths_are_strict(
             np.testing.assert_array_equal(getattr(frame, name), getattr(wanted, name))
         assert (frame.time_s, frame.camera) == (wanted.time_s, wanted.camera)
     np.testing.assert_equal(sequence.truth(), intact.truth())
-    assert main(["convert", str(folder), "--out", str(tmp_path / "run"), "--strict-paths"]) == 2
-    said = capsys.readouterr()
-    assert (said.out, said.err.count("\n")) == ("", 1)
-    assert f"leads out of the sequence, to {tmp_path / 'outside'}" in said.err
-    assert {path.name for path in tmp_path.iterdir()} == {"in", "outside"}
-
-
-def test_strict_paths_of_a_build_make_nothing(written: Path, tmp_path: Path) -> None:
-    shutil.copytree(written / "bop", tmp_path / "in")
-    link_out(D, place=0)(tmp_path / "in")
-    assert main(["build", str(tmp_path / "in"), "--out", str(tmp_path / "run"), "--strict-paths"]) == 2
+    said = refusal("convert", folder, "--out", tmp_path / "run", "--strict-paths")
+    assert f"leads out of the sequence, to {tmp_path / 'outside'}" in said
+    if (kind, linked) == ("bop", D):
+        refusal("build", folder, "--out", tmp_path / "run", "--strict-paths")
     assert {path.name for path in tmp_path.iterdir()} == {"in", "outside"}
 
 
@@ -282,21 +270,17 @@ def test_converting_a_broken_sequence_leaves_nothing(written: Path, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
-def test_what_is_given_as_a_scale_is_checked(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(written / "tum"), "--depth-scale-mm", "1000"]) == 2
-    assert "it looks like millimetres" in capsys.readouterr().err
-    assert main(["info", str(written / "tum"), "--depth-scale-mm", "-1"]) == 2
-    assert main(["info", str(written / "tum"), "--intrinsics", "0", "1", "2", "3"]) == 2
-    assert main(["info", str(written / "tum"), "--intrinsics", "nan", "1", "2", "3"]) == 2
+def test_what_is_given_as_a_scale_is_checked(written: Path, refusal: Callable[..., str]) -> None:
+    assert "it looks like millimetres" in refusal("info", written / "tum", "--depth-scale-mm", "1000")
+    for option in ("--depth-scale-mm -1", "--intrinsics 0 1 2 3", "--intrinsics nan 1 2 3"):
+        refusal("info", written / "tum", *option.split())
 
 
-def test_single_empty_frames_are_named_and_left_out(
-    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_single_empty_frames_are_named_and_left_out(written: Path, tmp_path: Path, cli: Run) -> None:
     shutil.copytree(written / "bop", tmp_path / "in")
     pixels(D, np.zeros_like)(tmp_path / "in")
     pixels("mask_visib/*2_*.png", np.zeros_like, every=True)(tmp_path / "in")
-    assert main(["info", str(tmp_path / "in")]) == 0
-    said = capsys.readouterr().out
+    status, said, _ = cli("info", tmp_path / "in")
+    assert status == 0
     assert "no measurement at all in frames 1: they will be left out" in said
     assert "nothing measured inside the mask in frames 2: they will be left out" in said

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from modeler.cli import main
 from modeler.sequences import Overrides, open_sequence
 from modeler.sequences.live import LIBRARIES
 from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, InputError, SensorNoise
@@ -246,12 +245,9 @@ def test_values_that_are_given_count_before_those_of_a_camera(maker: str, shown:
 
 
 def test_a_camera_that_is_not_there_or_falls_silent_is_said_in_one_line(
-    maker: str, shown: Shown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    maker: str, shown: Shown, refusal: Callable[..., str]
 ) -> None:
-    assert main(["info", f"{maker}:other"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"modeler: {maker}:other: ")
-    assert said.count("\n") == 1
+    assert refusal("info", f"{maker}:other").startswith(f"modeler: {maker}:other: ")
     sequence = open_sequence(f"{maker}:")
     shown.silent = True
     with pytest.raises(InputError, match="gives no image"):
@@ -260,14 +256,12 @@ def test_a_camera_that_is_not_there_or_falls_silent_is_said_in_one_line(
         open_sequence(f"{maker}:")
 
 
+@pytest.mark.parametrize("maker", LIBRARIES)
 def test_without_the_library_it_says_what_to_install(
-    maker: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    maker: str, monkeypatch: pytest.MonkeyPatch, refusal: Callable[..., str]
 ) -> None:
     monkeypatch.setitem(sys.modules, LIBRARIES[maker][0], None)
-    assert main(["info", f"{maker}:"]) == 2
-    said = capsys.readouterr().err
-    assert f"-m pip install 'modeler[{maker}]'" in said
-    assert said.count("\n") == 1
+    assert f"-m pip install 'modeler[{maker}]'" in refusal("info", f"{maker}:")
 
 
 def test_a_folder_of_that_name_is_a_folder(maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

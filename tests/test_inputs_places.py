@@ -12,9 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-import command_runner
 import pytest
-from command_runner import with_files_of_at_most
+from command_runner import Run, refusal_of, with_files_of_at_most
 from input_errors import refused
 
 from modeler.cli import main
@@ -26,29 +25,22 @@ from studies.fuzz.special import SPECIAL, lengthen, remove, replace_by
 from studies.fuzz.targets import TARGETS, Target, fresh
 
 
-def test_the_folder_of_a_run_is_no_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_folder_of_a_run_is_no_sequence(tmp_path: Path, refusal: Callable[..., str]) -> None:
     (tmp_path / "report.json").write_text("{}")
     (tmp_path / "model.ply").write_text("ply")
-    assert main(["info", str(tmp_path)]) == 2
-    assert "is the folder of a run" in capsys.readouterr().err
+    assert "is the folder of a run" in refusal("info", tmp_path)
 
 
-def test_pictures_that_lie_elsewhere_are_seen(
-    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pictures_that_lie_elsewhere_are_seen(written: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     for place in (tmp_path / "flat", tmp_path / "deeper" / "images"):
         shutil.copytree(written / "bop" / "depth", place)
     for name, words in (("flat", "no folder depth"), ("deeper", "no depth images")):
-        assert main(["info", str(tmp_path / name)]) == 2
-        assert words in capsys.readouterr().err
+        assert words in refusal("info", tmp_path / name)
     (tmp_path / "deeper" / "images").rename(tmp_path / "deeper" / "Depth_16bit")
-    assert main(["info", str(tmp_path / "deeper")]) == 2
-    assert "Depth_16bit" in capsys.readouterr().err
+    assert "Depth_16bit" in refusal("info", tmp_path / "deeper")
     shutil.copytree(written / "bop", tmp_path / "monday" / "take 1" / "scan")
-    assert main(["info", str(tmp_path / "monday")]) == 2
-    assert "take 1/scan" in capsys.readouterr().err
-    assert main(["info", str(tmp_path / "monday" / "take 1")]) == 2
-    assert "holds a sequence; give it: scan" in capsys.readouterr().err
+    assert "take 1/scan" in refusal("info", tmp_path / "monday")
+    assert "holds a sequence; give it: scan" in refusal("info", tmp_path / "monday" / "take 1")
 
 
 def test_a_path_that_is_misspelt_is_asked_about(tmp_path: Path) -> None:
@@ -62,12 +54,9 @@ def test_a_path_that_is_misspelt_is_asked_about(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["nowhere", "nowhere.bag", "", "file.txt"])
-def test_a_path_without_a_sequence_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+def test_a_path_without_a_sequence_is_refused(tmp_path: Path, refusal: Callable[..., str], name: str) -> None:
     (tmp_path / "file.txt").write_text("hello")
-    assert main(["info", str(tmp_path / name)]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert str(tmp_path / name) in said
+    assert str(tmp_path / name) in refusal("info", tmp_path / name)
 
 
 @pytest.fixture
@@ -91,21 +80,16 @@ def as_nobody() -> Iterator[Callable[[], None]]:
         ("open3d", "camera_intrinsic.json"),
     ],
 )
-def test_no_permission_is_said(
-    written: Path, as_nobody: Callable[[], None], capsys: pytest.CaptureFixture[str], kind: str, what: str
-) -> None:
+def test_no_permission_is_said(written: Path, as_nobody: Callable[[], None], cli: Run, kind: str, what: str) -> None:
     with tempfile.TemporaryDirectory() as place:  # pytest's own folders are closed to others
         os.chmod(place, 0o755)
         folder = Path(place) / kind
         shutil.copytree(written / kind, folder)
         (folder / what).chmod(0)
         as_nobody()
-        status = main(["info", str(folder)])
-        said = capsys.readouterr().err
+        ended = cli("info", folder)
         os.seteuid(os.getuid())
-    assert status == 2
-    assert said.count("\n") == 1
-    assert "ermission" in said
+    assert "ermission" in refusal_of(ended)
 
 
 def test_a_full_disk_leaves_nothing_behind(written: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -216,7 +200,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_bop(folder / "s", small_frames(4), small_truth(4), depth_scale_mm=1.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        command_runner.main(["build", "s", "--out", "a", "--prior", "table", "--method", "icp"])
+        main(["build", "s", "--out", "a", "--prior", "table", "--method", "icp"])
     shutil.copytree(folder / "a", folder / "b")
     return folder
 
@@ -245,19 +229,14 @@ COMMANDS = {
 @pytest.mark.parametrize("kind", ["FIFO", "socket", "device", "folder", "loop of links"])
 @pytest.mark.parametrize("case", COMMANDS)
 def test_every_command_refuses_special_files(
-    built: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    case: str,
-    kind: str,
+    built: Path, tmp_path: Path, cli: Run, monkeypatch: pytest.MonkeyPatch, case: str, kind: str
 ) -> None:
     arguments, name = COMMANDS[case]
     shutil.copytree(built, tmp_path / "in")
     monkeypatch.chdir(tmp_path / "in")
     replace_by(kind, Path(name))
     with in_time():
-        ended = command_runner.runner(capfd)(*arguments)
+        ended = cli(*arguments)
     assert (ended.status, ended.out) == (2, "")
     last = ended.err.splitlines()[-1]
     assert last.startswith("modeler: ")
@@ -266,7 +245,7 @@ def test_every_command_refuses_special_files(
 
 
 def test_a_resumed_build_makes_again_what_is_no_kept_pair(
-    built: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    built: Path, tmp_path: Path, cli: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(built, tmp_path / "in")
     monkeypatch.chdir(tmp_path / "in")
@@ -278,5 +257,5 @@ def test_a_resumed_build_makes_again_what_is_no_kept_pair(
     for file in kept:
         replace_by("FIFO", file)
     with in_time():
-        assert command_runner.runner(capfd)(*build).status in (0, 3)
+        assert cli(*build).status in (0, 3)
     assert json.loads(Path("a/report.json").read_text())["poses"] == report["poses"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -52,9 +53,8 @@ def test_noise_along_the_ray_is_that_of_the_renderer(still: RenderedSequence, me
         slope = (one.angle_rad / (np.pi / 2.0 - one.angle_rad)) ** 2
         noise_px = camera.disparity.sigma_px * (1.0 + camera.disparity.slope_gain * slope)
         true_m = one.distance_m**2 / focal_baseline * np.hypot(noise_px, camera.disparity.quantum_px / np.sqrt(12.0))
-        off.append(
-            (np.sqrt(one.variance_m2) / true_m, float(measured.model.sigma_r_m(one.distance_m, one.angle_rad)) / true_m)
-        )
+        modelled_m = float(measured.model.sigma_r_m(one.distance_m, one.angle_rad))
+        off.append((np.sqrt(one.variance_m2) / true_m, modelled_m / true_m))
     assert len(off) > 8
     np.testing.assert_allclose(off, 1.0, atol=0.15)
     assert max(one.distance_m for one in measured.bins) > 1.4 * min(one.distance_m for one in measured.bins)
@@ -107,10 +107,8 @@ def test_what_is_stored_is_what_is_used(
     record = json.loads(path.read_text())
     assert record["frames"] == FRAMES
     assert len(record["along"]) == len(measured.bins)
-    assert (
-        main(["convert", str(bundled("box")), "--sensor", str(path), "--frames", "0:2", "--out", str(tmp_path / "b")])
-        == 0
-    )
+    converted = ["convert", str(bundled("box")), "--frames", "0:2", "--out", str(tmp_path / "b")]
+    assert main([*converted, "--sensor", str(path)]) == 0
     noise = open_sequence(tmp_path / "b").sensor()
     box = open_sequence(bundled("box"))
     assert noise[:2] == pytest.approx(stored.at(object_distance_m(box.frame(0))))
@@ -148,7 +146,7 @@ def test_noise_grows_with_distance_and_slope() -> None:
     ],
 )
 def test_a_file_that_says_something_else_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], change
+    tmp_path: Path, refusal: Callable[..., str], change: Callable[[dict], object]
 ) -> None:
     tree = json.loads(noise_text(MODEL, {}))
     path = tmp_path / "noise.json"
@@ -156,8 +154,5 @@ def test_a_file_that_says_something_else_is_one_line(
     assert read_noise(path) == MODEL
     change(tree["noise"])
     path.write_text(json.dumps(tree))
-    assert main(["build", str(bundled("box")), "--sensor", str(path), "--out", str(tmp_path / "run")]) == 2
-    said = capsys.readouterr().err
-    assert str(path) in said
-    assert said.count("\n") == 1
+    assert str(path) in refusal("build", bundled("box"), "--sensor", path, "--out", tmp_path / "run")
     assert not (tmp_path / "run").exists()

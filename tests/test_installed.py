@@ -13,7 +13,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from command_runner import FILES
+from command_runner import FILES, refusal_of, spawned
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from source_trees import ROOT
@@ -40,8 +40,8 @@ for module in pkgutil.walk_packages(modeler.__path__, "modeler."):
         if str(error.name).startswith("modeler"):
             raise
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (0, "")
+    ended = spawned("-c", code)
+    assert (ended.status, ended.err) == (0, "")
 
 
 WITHOUT = """
@@ -85,13 +85,11 @@ def test_the_demonstration_runs_on_what_is_installed_for_it(scene: Path, tmp_pat
         module for module, (owner, *_) in modules.items() if owner.lower().replace("_", "-") not in {*needed, "modeler"}
     ]
     assert {"open3d", "matplotlib", "trimesh", "hypothesis"} <= {*refused}
-    build = ["build", str(scene), "--prior", "table", "--out", str(tmp_path / "run")]
-    command = [sys.executable, "-c", WITHOUT, ",".join(refused)]
-    built = subprocess.run([*command, *build], capture_output=True, text=True, check=False)
-    assert built.returncode in (0, 3), built.stderr
-    shown = subprocess.run([*command, "report", str(tmp_path / "run")], capture_output=True, text=True, check=False)
-    assert (shown.returncode, shown.stderr.count("\n")) == (2, 1)
-    assert re.search(r"the package \w+ is not installed, which this command needs; run make setup", shown.stderr)
+    command = ("-c", WITHOUT, ",".join(refused))
+    built = spawned(*command, "build", scene, "--prior", "table", "--out", tmp_path / "run")
+    assert built.status in (0, 3), built.err
+    said = refusal_of(spawned(*command, "report", tmp_path / "run"))
+    assert re.search(r"the package \w+ is not installed, which this command needs; run make setup", said)
 
 
 @pytest.mark.slow

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import tabletop
 import trimesh
+from command_runner import Run
 
 from modeler import se3
 from modeler.cli import main
@@ -90,9 +91,17 @@ def true_run(sequence: RenderedSequence, scene: Path, path: Path) -> None:
     folder.write(last, RunMeta(sequence=str(scene), seed=0, prior="turntable"))
 
 
+class Runs(NamedTuple):
+    """Two runs, the run that joins them, and true object_from_camera (4, 4) but for the object frame, by number."""
+
+    upright: Path
+    lying: Path
+    joined: Path
+    truth: dict[int, Array]
+
+
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, dict[int, Array]]:
-    """Return two runs, the run that joins them, and true object_from_camera but for the object frame, by number."""
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folder = tmp_path_factory.mktemp("join")
     lying = Compound((Part(FIGURE, offset_m=(0.0, 0.0, 0.045), rotation_deg=(90.0, 0.0, 0.0)),))
     poses: dict[int, Array] = {}
@@ -110,66 +119,64 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, di
     (parts[0] / "report.json").write_text(json.dumps(report))
     status = main(["join", *map(str, parts), "--out", str(folder / "joined"), "--pairs", "4"])
     assert status == 0
-    return *parts, folder / "joined", poses
+    return Runs(*parts, folder / "joined", poses)
 
 
-def test_frames_of_both_runs_find_their_places(runs: tuple[Path, Path, Path, dict[int, Array]]) -> None:
-    report = RunFolder(runs[2]).report()
+def test_frames_of_both_runs_find_their_places(runs: Runs) -> None:
+    report = RunFolder(runs.joined).report()
     assert [frame["id"] for frame in report["frames"]] == list(range(2 * COUNT))
     assert report["settings"]["joined"] == [f"../{run.name}" for run in runs[:2]]
     assert report["tolerance_m"] == 0.012  # as stated for one of the runs
     poses = {pose["id"]: np.reshape(pose["object_from_camera"], (4, 4)) for pose in report["poses"]}
-    base = poses[0] @ se3.inverse(runs[3][0])
+    base = poses[0] @ se3.inverse(runs.truth[0])
     for k, pose in poses.items():
-        off = se3.inverse(base @ runs[3][k]) @ pose
+        off = se3.inverse(base @ runs.truth[k]) @ pose
         assert np.degrees(se3.rotation_angle(off)) < 2.0
-    assert {path.name for path in runs[2].iterdir()} == {
+    assert {path.name for path in runs.joined.iterdir()} == {
         "model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd", "report.json"
     }  # fmt: skip
     times_s = [frame["timestamp"] for frame in report["frames"]]
     assert (np.diff(times_s) > 0.0).all()
-    assert len(trajectory(runs[2] / "trajectory.txt")) == 2 * COUNT
+    assert len(trajectory(runs.joined / "trajectory.txt")) == 2 * COUNT
     joining = [edge for edge in report["edges"] if edge["source"] >= COUNT > edge["target"]]
     assert len(joining) == 4
     assert sum(edge["accepted"] for edge in joining) >= 2
 
 
-def test_a_joined_model_has_what_each_run_hid(runs: tuple[Path, Path, Path, dict[int, Array]]) -> None:
+def test_a_joined_model_has_what_each_run_hid(runs: Runs) -> None:
     areas = [trimesh.load_mesh(run / "model.ply", process=False).area for run in runs[:3]]
     assert areas[2] > 1.02 * max(areas[:2])
-    mesh = trimesh.load_mesh(runs[2] / "model.ply", process=False)
-    report = RunFolder(runs[2]).report()
-    object_from_model = np.reshape(report["poses"][0]["object_from_camera"], (4, 4)) @ se3.inverse(runs[3][0])
+    mesh = trimesh.load_mesh(runs.joined / "model.ply", process=False)
+    report = RunFolder(runs.joined).report()
+    object_from_model = np.reshape(report["poses"][0]["object_from_camera"], (4, 4)) @ se3.inverse(runs.truth[0])
     bottom = se3.transform(se3.inverse(object_from_model), np.asarray(mesh.vertices))
     under = (np.abs(bottom[:, 2]) < 3e-3) & (np.hypot(bottom[:, 0] - 0.004, bottom[:, 1]) < 0.025)
     assert under.sum() > 50  # only the lying run shows it
 
 
 def test_the_recording_shows_a_pair_of_views_that_joins_the_runs(
-    runs: tuple[Path, Path, Path, dict[int, Array]],
+    runs: Runs,
 ) -> None:
-    report = json.loads((runs[2] / "report.json").read_bytes())
+    report = json.loads((runs.joined / "report.json").read_bytes())
     overlaps = {
         (edge["source"], edge["target"]): edge["overlap"]
         for edge in report["edges"]
         if edge["accepted"] and edge["source"] >= COUNT > edge["target"]
     }
     source, target = max(overlaps, key=overlaps.__getitem__)
-    pair = recorded(runs[2] / "recording.rrd")
+    pair = recorded(runs.joined / "recording.rrd")
     (row,) = pair[entities.PAIR_AFTER].values()
     moved = cloud(row)
     edge = next(edge for edge in report["edges"] if (edge["source"], edge["target"]) == (source, target))
-    view = reopened(runs[2]).views[source]
+    view = reopened(runs.joined).views[source]
     expected = se3.transform(np.reshape(edge["target_from_source"], (4, 4)), view.points_m)
     np.testing.assert_allclose(moved[0].mean(axis=0), expected.mean(axis=0), atol=1e-3)
 
 
 @pytest.mark.slow
-def test_exports_made_anew_from_the_frames(
-    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_exports_made_anew_from_the_frames(runs: Runs, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "figure.stl"
-    assert main(["export", str(runs[2]), "--out", str(out), "--watertight", "--triangles", "4000"]) == 0
+    assert main(["export", str(runs.joined), "--out", str(out), "--watertight", "--triangles", "4000"]) == 0
     assert "% of the vertices interpolated" in capfd.readouterr().err
     mesh = trimesh.load_mesh(out)
     assert mesh.is_volume
@@ -178,14 +185,14 @@ def test_exports_made_anew_from_the_frames(
 
 
 def test_sequences_of_a_joined_run_may_have_moved(
-    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    runs: Runs, tmp_path: Path, cli: Run, refusal: Callable[..., str]
 ) -> None:
-    folder = runs[2].parent
+    folder = runs.joined.parent
     moved = [(folder / name).rename(tmp_path / name) for name in ("upright", "lying")]
-    out, options = tmp_path / "m.ply", [word for path in moved for word in ("--sequence", str(path))]
+    out, options = tmp_path / "m.ply", [word for path in moved for word in ("--sequence", path)]
     try:
-        command = ["export", str(runs[2]), "--out", str(out), "--voxel-m", "0.005"]
-        assert main([*command, *options]) == 0
+        command = ["export", runs.joined, "--out", out, "--voxel-m", "0.005"]
+        assert cli(*command, *options).status == 0
         out.unlink()
         pose_file(out).unlink()
         for wrong, words in (
@@ -194,18 +201,17 @@ def test_sequences_of_a_joined_run_may_have_moved(
             ([*options, *options[:2]], "--sequence is given 3 times"),
             (options[2:] + options[:2], "differs from the one"),
         ):
-            assert main([*command, *wrong]) == 2
-            assert words in capfd.readouterr().err
+            assert words in refusal(*command, *wrong)
         assert not out.exists()
     finally:
         for path in moved:
             path.rename(folder / path.name)
 
 
-def test_a_textured_export_shows_the_colours(runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path) -> None:
+def test_a_textured_export_shows_the_colours(runs: Runs, tmp_path: Path) -> None:
     out = tmp_path / "figure.glb"
     smaller = ["--triangles", "1500", "--voxel-m", "0.005", "--texture-px", "512"]
-    assert main(["export", str(runs[0]), "--out", str(out), "--texture", *smaller]) == 0
+    assert main(["export", str(runs.upright), "--out", str(out), "--texture", *smaller]) == 0
     (mesh,) = trimesh.load_scene(out).geometry.values()
     image = np.asarray(mesh.visual.material.baseColorTexture)[:, :, :3].reshape(-1, 3).astype(float)
     green = image[:, 1] - image[:, 0]
@@ -225,17 +231,10 @@ def test_a_textured_export_shows_the_colours(runs: tuple[Path, Path, Path, dict[
     ],
 )
 def test_exports_that_cannot_be_are_said_in_one_line(
-    runs: tuple[Path, Path, Path, dict[int, Array]],
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    arguments: list[str],
-    words: str,
+    runs: Runs, tmp_path: Path, refusal: Callable[..., str], arguments: list[str], words: str
 ) -> None:
-    arguments = [str(tmp_path / word) if word.startswith("a.") else word for word in arguments]
-    assert main(["export", str(runs[0]), *arguments]) == 2
-    stated = capfd.readouterr().err
-    assert words in stated
-    assert stated.count("\n") == 1
+    given = [tmp_path / word if word.startswith("a.") else word for word in arguments]
+    assert words in refusal("export", runs.upright, *given)
     assert not list(tmp_path.iterdir())
 
 
@@ -255,47 +254,51 @@ def test_models_are_laid_on_each_other_from_any_side() -> None:
     assert all(match.score <= best.score for match in rest)
 
 
-def test_the_size_of_voxels_is_checked_before_a_build(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["build", str(tmp_path), "--out", str(tmp_path / "run"), "--voxel-m", "0"]) == 2
-    assert "--voxel-m 0 is out of range" in capfd.readouterr().err
+def test_the_size_of_voxels_is_checked_before_a_build(tmp_path: Path, refusal: Callable[..., str]) -> None:
+    said = refusal("build", tmp_path, "--out", tmp_path / "run", "--voxel-m", "0")
+    assert "--voxel-m 0 is out of range" in said
     assert not (tmp_path / "run").exists()
 
 
 def test_nothing_is_joined_into_a_folder_that_another_program_writes_to(
-    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    runs: Runs, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
     out = tmp_path / "joined"
     with locked(out):
-        assert main(["join", str(runs[0]), str(runs[1]), "--out", str(out)]) == 2
-    assert f"{out}: another run is writing to it" in capfd.readouterr().err
+        assert f"{out}: another run is writing to it" in refusal("join", runs.upright, runs.lying, "--out", out)
     assert not list(out.iterdir())
 
 
-def test_joins_that_cannot_be_are_said_in_one_line(
-    runs: tuple[Path, Path, Path, dict[int, Array]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_joins_that_cannot_be_are_said_in_one_line(runs: Runs, tmp_path: Path, refusal: Callable[..., str]) -> None:
     (tmp_path / "notes.txt").write_text("mine")
+    new = ("--out", tmp_path / "new")
     for arguments, words in (
-        ([str(runs[0]), str(runs[1]), "--out", str(tmp_path)], "not empty"),
-        ([str(runs[0]), str(tmp_path / "none"), "--out", str(tmp_path / "new")], "no report"),
-        ([str(runs[0]), str(runs[1]), "--out", str(tmp_path / "new"), "--pairs", "0"], "--pairs 0"),
-        ([str(runs[0]), f"{runs[0]}/../{runs[0].name}", "--out", str(tmp_path / "new")], "name two runs"),
+        ((runs.upright, runs.lying, "--out", tmp_path), "not empty"),
+        ((runs.upright, tmp_path / "none", *new), "no report"),
+        ((runs.upright, runs.lying, *new, "--pairs", "0"), "--pairs 0"),
+        ((runs.upright, f"{runs.upright}/../{runs.upright.name}", *new), "name two runs"),
     ):
-        assert main(["join", *arguments]) == 2
-        stated = capfd.readouterr().err
-        assert words in stated
-        assert stated.count("\n") == 1
+        assert words in refusal("join", *arguments)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 @pytest.fixture(scope="module")
-def grown(runs: tuple[Path, Path, Path, dict[int, Array]]) -> tuple[Path, dict[int, Array]]:
+def grown(runs: Runs) -> tuple[Path, dict[int, Array]]:
     """Return a run that goes on with another, and the true object_from_camera but for the object frame, by number."""
-    folder, second = runs[0].parent, rendered("second", FIGURE, 5)
+    folder, second = runs.upright.parent, rendered("second", FIGURE, 5)
     write_bop(folder / "second", second, None, {})
-    words = ["build", str(folder / "second"), "--model", str(runs[0]), "--out", str(folder / "both"), "--every", "3"]
+    words = [
+        "build",
+        str(folder / "second"),
+        "--model",
+        str(runs.upright),
+        "--out",
+        str(folder / "both"),
+        "--every",
+        "3",
+    ]
     assert main(words) in (0, 3)  # the spin of such a figure is uncertain by 2.5 degrees, as the verdict says
-    first = {k: pose for k, pose in runs[3].items() if k < COUNT}
+    first = {k: pose for k, pose in runs.truth.items() if k < COUNT}
     return folder / "both", first | {COUNT + k: se3.inverse(pose) for k, pose in second.truth().items()}
 
 
@@ -324,10 +327,9 @@ def test_a_run_that_goes_on_with_another_is_opened_again(grown: tuple[Path, dict
 
 
 def test_options_of_a_build_from_nothing_are_refused(
-    grown: tuple[Path, dict[int, Array]], capsys: pytest.CaptureFixture[str]
+    grown: tuple[Path, dict[int, Array]], refusal: Callable[..., str]
 ) -> None:
     folder = grown[0].parent
-    words = ["build", str(folder / "second"), "--model", str(folder / "upright_run"), "--out", str(folder / "other")]
-    assert main([*words, "--prior", "table"]) == 2
-    assert capsys.readouterr().err.endswith("leave out --prior\n")
+    words = ["build", folder / "second", "--model", folder / "upright_run", "--out", folder / "other"]
+    assert refusal(*words, "--prior", "table").endswith("leave out --prior\n")
     assert not (folder / "other").exists()

@@ -100,12 +100,7 @@ GONE: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("how", GONE)
 def test_what_goes_away_during_a_build_takes_no_result_with_it(
-    scene: Path,
-    whole: Path,
-    tmp_path: Path,
-    how: str,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    scene: Path, whole: Path, tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch, caplog: Any
 ) -> None:
     run, write = tmp_path / "run", RunFolder.write
 
@@ -123,25 +118,23 @@ def test_what_goes_away_during_a_build_takes_no_result_with_it(
 
 
 def test_a_run_that_had_ended_is_not_made_again(
-    scene: Path, whole: Path, asked: list[tuple[int, int]], capsys: pytest.CaptureFixture[str]
+    scene: Path, whole: Path, asked: list[tuple[int, int]], cli: Run
 ) -> None:
     before = {path.name: path.stat().st_mtime_ns for path in whole.iterdir()}
-    assert main(["build", str(scene), "--out", str(whole), *QUICK, "--resume"]) == 0
-    assert "--overwrite" in capsys.readouterr().err
+    ended = cli("build", scene, "--out", whole, *QUICK, "--resume")
+    assert (ended.status, "--overwrite" in ended.err) == (0, True)
     assert ({path.name: path.stat().st_mtime_ns for path in whole.iterdir()}, asked) == (before, [])
 
 
 @pytest.mark.parametrize("missing", ["frames", "reasons", "poses"])
 def test_a_run_whose_report_is_damaged_is_not_resumed(
-    scene: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
+    scene: Path, whole: Path, tmp_path: Path, refusal: Callable[..., str], missing: str
 ) -> None:
     report = RunFolder(whole).report()
     del report[missing]
     (tmp_path / "report.json").write_text(json.dumps(report))
-    assert main(["build", str(scene), "--out", str(tmp_path), *QUICK, "--resume"]) == 2
-    said = capsys.readouterr().err
+    said = refusal("build", scene, "--out", tmp_path, *QUICK, "--resume")
     assert said.startswith(f"modeler: {tmp_path / 'report.json'}: {missing!r} is missing")
-    assert said.count("\n") == 1
 
 
 def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
@@ -170,12 +163,7 @@ def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(
 
 
 def test_a_run_that_other_versions_began_is_registered_anew(
-    scene: Path,
-    whole: Path,
-    tmp_path: Path,
-    asked: list[tuple[int, int]],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    scene: Path, whole: Path, tmp_path: Path, asked: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch, cli: Run
 ) -> None:
     folder, version = tmp_path / "run", metadata.version
     with monkeypatch.context() as patch:
@@ -184,9 +172,8 @@ def test_a_run_that_other_versions_began_is_registered_anew(
         assert main(["build", str(scene), "--out", str(folder), *QUICK]) == 0
     assert len(list((folder / ".pairs").iterdir())) == len(pairs_of(whole))
     asked.clear()
-    capsys.readouterr()
-    assert main(["build", str(scene), "--out", str(folder), *QUICK, "--resume"]) == 0
-    assert "modeler 0.0.1, numpy 0.0.1" in capsys.readouterr().err
+    ended = cli("build", scene, "--out", folder, *QUICK, "--resume")
+    assert (ended.status, "modeler 0.0.1, numpy 0.0.1" in ended.err) == (0, True)
     assert set(asked) == pairs_of(whole)
     assert contents(folder) == contents(whole)
 
@@ -269,11 +256,11 @@ def test_ctrl_c_before_the_first_frame_ends_the_program(
     assert main(["build", str(scene), "--out", str(tmp_path / "run"), *QUICK]) == 130
 
 
-def test_two_runs_do_not_write_into_one_folder(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_runs_do_not_write_into_one_folder(scene: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     with locked(tmp_path / "run"):
         for flag in ("--resume", "--overwrite"):
-            assert main(["build", str(scene), "--out", str(tmp_path / "run"), *QUICK, flag]) == 2
-            assert "another run is writing to it" in capsys.readouterr().err
+            said = refusal("build", scene, "--out", tmp_path / "run", *QUICK, flag)
+            assert "another run is writing to it" in said
     with locked(tmp_path / "run"):
         assert list((tmp_path / "run").iterdir()) == []
     (tmp_path / "file").touch()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,13 +120,12 @@ def test_evaluate_tells_how_good_the_model_of_a_run_is(built: Path, tmp_path: Pa
 
 
 def test_a_run_that_cannot_be_judged_is_left_out_and_the_others_are_judged(
-    scene: Path, built: Path, tmp_path: Path, cli: Run
+    scene: Path, built: Path, tmp_path: Path, cli: Run, refusal: Callable[..., str]
 ) -> None:
     _, run = _without(scene, built, tmp_path, "model.ply")
     out = tmp_path / "out"
-    status, said, err = cli("evaluate", run, built, tmp_path / "none", "--out", out)
-    assert (status, said, err.count("\n")) == (2, "", 1)
-    assert err.startswith(f"modeler: {tmp_path / 'none'}: no such folder")
+    said = refusal("evaluate", run, built, tmp_path / "none", "--out", out)
+    assert said.startswith(f"modeler: {tmp_path / 'none'}: no such folder")
     status, said, err = cli("evaluate", run, built, "--out", out)
     assert status == 2
     assert [line.split()[0] for line in said.splitlines()[1:]] == [str(built)] * 4
@@ -136,14 +136,14 @@ def test_a_run_that_cannot_be_judged_is_left_out_and_the_others_are_judged(
     for name in ("models.json", "models.csv"):
         (out / name).unlink()
     for runs in ((run,), (run, run)):
-        status, said, err = cli("evaluate", *runs, "--out", out)
-        assert (status, said, err.count("\n")) == (2, "", 1)
-        assert "no true surface" in err
+        assert "no true surface" in refusal("evaluate", *runs, "--out", out)
     assert not (out / "models.json").exists()
 
 
 @pytest.mark.slow
-def test_another_sequence_is_not_taken_for_that_of_the_run(scene: Path, built: Path, tmp_path: Path, cli: Run) -> None:
+def test_another_sequence_is_not_taken_for_that_of_the_run(
+    scene: Path, built: Path, tmp_path: Path, cli: Run, refusal: Callable[..., str]
+) -> None:
     sequence, run = _without(scene, built, tmp_path)
     moved = sequence.rename(tmp_path / "moved")
     page = ("report", run, "--overwrite", "--out", tmp_path / "page.html")
@@ -151,13 +151,10 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(scene: Path, built: P
     assert status == 0
     assert "Errors against ground truth" in (tmp_path / "page.html").read_text()
     for command in (page, ("export", run, "--out", tmp_path / "m.ply", "--voxel-m", "0.005")):
-        status, out, err = cli(*command, "--sequence", bundled("tube"))
-        assert (status, out, err.count("\n")) == (2, "", 1)
-        assert "tube: frame 0 differs from the one" in err
-        assert str(run) in err
-        status, _, err = cli(*command, "--sequence", moved, "--sequence", moved)
-        assert (status, err.count("\n")) == (2, 1)
-        assert "--sequence is given 2 times" in err
+        said = refusal(*command, "--sequence", bundled("tube"))
+        assert "tube: frame 0 differs from the one" in said
+        assert str(run) in said
+        assert "--sequence is given 2 times" in refusal(*command, "--sequence", moved, "--sequence", moved)
     assert not (tmp_path / "m.ply").exists()
     (tmp_path / "page.html").unlink()
     assert cli(*page)[0] == 0  # without its sequence
@@ -180,7 +177,7 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(scene: Path, built: P
 )
 @pytest.mark.parametrize("value", ["gone", [1.0, 2.0], {}])
 def test_a_damaged_report_is_one_line(
-    built: Path, tmp_path: Path, cli: Run, place: tuple[str | int, ...], value: object
+    built: Path, tmp_path: Path, refusal: Callable[..., str], place: tuple[str | int, ...], value: object
 ) -> None:
     shutil.copytree(built, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd", "*.ply"))
     path = tmp_path / "run" / "report.json"
@@ -200,10 +197,9 @@ def test_a_damaged_report_is_one_line(
         ["evaluate", "--out", tmp_path],
         ["join", built, "--out", tmp_path / "joined"],
     ):
-        status, out, err = cli(command[0], tmp_path / "run", *command[1:])
-        assert (status, out, err.count("\n")) == (2, "", 1)
-        assert f"{path}: " in err
-        assert "build the run again" in err
+        said = refusal(command[0], tmp_path / "run", *command[1:])
+        assert f"{path}: " in said
+        assert "build the run again" in said
 
 
 @pytest.mark.slow
@@ -221,9 +217,8 @@ def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
     assert {row["poses"]: row["f_5mm"] > 0.8 for row in found if row["over"] == "seen"} == {"run": True, "true": True}
 
 
-def test_sequences_and_runs_are_not_mixed(built: Path, tmp_path: Path, cli: Run) -> None:
-    status, out, err = cli("evaluate", BOX, built, "--out", tmp_path / "none")
-    assert (status, out, err.count("\n")) == (2, "", 1)
+def test_sequences_and_runs_are_not_mixed(built: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
+    refusal("evaluate", BOX, built, "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
@@ -241,12 +236,10 @@ def _without(scene: Path, built: Path, folder: Path, *names: str) -> tuple[Path,
     ("missing", "stated"), [("model.ply", "no true surface"), ("scene_gt.json", "no ground truth")]
 )
 def test_runs_without_truth_are_refused_in_one_line(
-    scene: Path, built: Path, tmp_path: Path, cli: Run, missing: str, stated: str
+    scene: Path, built: Path, tmp_path: Path, refusal: Callable[..., str], missing: str, stated: str
 ) -> None:
     _, run = _without(scene, built, tmp_path, missing)
-    status, out, err = cli("evaluate", run, "--out", tmp_path / "none")
-    assert (status, out, err.count("\n")) == (2, "", 1)
-    assert stated in err
+    assert stated in refusal("evaluate", run, "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -93,27 +94,26 @@ NO_RUN = "not empty, and not the folder of a run"
         ("evaluate R --out S", READ),
     ],
 )
-def test_what_is_read_and_what_is_there_stays_as_it_is(cli: Run, places: Path, command: str, says: str) -> None:
+def test_what_is_read_and_what_is_there_stays_as_it_is(
+    refusal: Callable[..., str], places: Path, command: str, says: str
+) -> None:
     before = contents(places)
     words = [str(places / word) if (places / word.split("/")[0]).exists() and "--" not in word else word
              for word in command.split()]  # fmt: skip
     place = words.index("--out") + 1
     words[place] = os.path.join(places, command.split()[place])
-    ended = cli(*words)
-    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert any(part in ended.err for part in says.split("|")), ended.err
+    said = refusal(*words)
+    assert any(part in said for part in says.split("|")), said
     assert contents(places) == before
 
 
 @pytest.mark.parametrize("kind", ["sensor", "camera"])
-def test_the_calibration_that_a_run_was_made_with_is_only_read(cli: Run, places: Path, kind: str) -> None:
+def test_the_calibration_of_a_run_is_only_read(refusal: Callable[..., str], places: Path, kind: str) -> None:
     report = json.loads((places / "R" / "report.json").read_bytes())
     report["settings"][kind] = str(places / "calibration.json")
     (places / "R" / "report.json").write_text(json.dumps(report))
     (places / "calibration.json").write_text("measured")
-    ended = cli("calibrate-camera", places / "R", "--out", places / "calibration.json", "--overwrite")
-    assert ended.status == 2
-    assert READ in ended.err
+    assert READ in refusal("calibrate-camera", places / "R", "--out", places / "calibration.json", "--overwrite")
     assert (places / "calibration.json").read_text() == "measured"
 
 
@@ -125,13 +125,14 @@ def test_a_file_is_replaced_where_that_is_asked_for(cli: Run, places: Path, name
     assert (places / name).read_bytes() != b"somebody's own"
 
 
-def test_poses_and_results_are_replaced_where_that_is_asked_for(cli: Run, places: Path) -> None:
+def test_poses_and_results_are_replaced_where_that_is_asked_for(
+    cli: Run, refusal: Callable[..., str], places: Path
+) -> None:
     assert cli("convert", places / "R", "--out", places / "poses.txt", "--overwrite").status == 0
     assert (places / "poses.txt").read_bytes() == (places / "R" / "trajectory.txt").read_bytes()
     (places / "results.csv").write_text("somebody's own")
-    ended = cli("evaluate", places / "S", "--out", places, "--methods", "icp")
-    assert ended.status == 2
-    assert "results.csv: exists already" in ended.err
+    said = refusal("evaluate", places / "S", "--out", places, "--methods", "icp")
+    assert "results.csv: exists already" in said
 
 
 def test_a_link_that_leads_nowhere_is_not_replaced(cli: Run, places: Path) -> None:

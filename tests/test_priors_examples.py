@@ -16,7 +16,6 @@ from prior_cases import (
     held,
     solution,
     stated,
-    surface,
     truth,
     turned,
     turntable,
@@ -157,11 +156,7 @@ def test_steps_share_the_axis_as_far_as_no_edge_holds_it() -> None:
     assert replace(unknown, axis_point_m=(0.0, 0.0, 0.8)).shared_axis(bare) is None
     on_table = replace(unknown, needs_table=True)  # a pair of which one view shows the table was not refused
     assert on_table.shared_axis([BARE_SOURCE, TARGET]) == place_alone
-    for guess in (
-        VelocityPrior(unknown),
-        FeaturesPrior(unknown),
-        ProductPrior(GeneralPrior(), unknown),
-    ):
+    for guess in (VelocityPrior(unknown), FeaturesPrior(unknown), ProductPrior(GeneralPrior(), unknown)):
         assert guess.shared_axis(bare) == unknown.shared_axis(bare)
     for other in (GeneralPrior(), TablePrior()):
         assert other.shared_axis(bare) is None
@@ -389,17 +384,6 @@ def test_a_finger_that_does_not_slip_carries_its_point_along() -> None:
     np.testing.assert_allclose(carried, 20 * step, rtol=1e-3, atol=1e-9)
 
 
-def test_a_push_through_the_middle_shifts_and_one_beside_it_turns() -> None:
-    middle, beside = np.zeros((1, 2)), np.array([[0.0, -0.04]])
-    step, radius_m = np.array([[0.001, 0.0]]), np.array([0.05])
-    turn, shift = pushed(middle, step, radius_m)
-    assert turn[0] == 0.0
-    np.testing.assert_allclose(shift[0], [0.02, 0.0], atol=1e-12)
-    turn, shift = pushed(beside, step, radius_m)
-    assert turn[0] > 0.1  # pushed to the right below the middle: counter-clockwise
-    assert 0.0 < shift[0, 0] < 0.02
-
-
 def poked(offset_m: Array, length_m: float = 0.03) -> tuple[PokePrior, Array]:
     """A push across the view beside the object's middle, and its direction in the table's plane."""
     across = np.cross(NORMAL, [0.0, 0.0, 1.0])
@@ -516,9 +500,3 @@ def test_a_product_leaves_the_limits_that_either_part_assumed() -> None:
 def test_a_guess_that_lies_outside_what_is_known_is_dropped() -> None:
     tight = VelocityPrior(GeneralPrior(max_rotation_deg=2.0)).learned(solution(HERE, 3), ())
     assert tight.between(SOURCE, TARGET).evidence
-
-
-def test_the_surface_of_the_cases_is_long_and_has_relief() -> None:
-    points_m, normals = surface()
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
-    assert np.std(points_m[:, 0]) > 1.6 * np.std(points_m[:, 1])

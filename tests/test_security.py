@@ -5,12 +5,11 @@ from __future__ import annotations
 import ast
 import json
 import os
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_runner import QUICK
+from command_runner import QUICK, spawned
 from source_trees import SOURCES, nodes
 
 import modeler
@@ -46,7 +45,7 @@ def everything(root: Path, but: Path) -> set[Path]:
     return {path for path in root.rglob("*") if not path.is_relative_to(but)}
 
 
-def test_outputs_stay_where_they_are_asked_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_outputs_stay_where_they_are_asked_to_be(tmp_path: Path) -> None:
     deep = tmp_path / "a" / "b" / "c" / "d" / "e"
     deep.mkdir(parents=True)
     source, out = deep / "in", deep / "out"
@@ -77,16 +76,9 @@ def test_python_files_in_the_current_folder_are_not_run(scene: Path, built: Path
     }[command]
     program = f"import sys; sys.path.insert(0, {str(Path(modeler.__file__).parent.parent)!r}); "
     program += "from modeler.__main__ import main; sys.exit(main())"
-    ended = subprocess.run(
-        [sys.executable, "-P", "-c", program, *map(str, arguments)],  # as the console script does
-        cwd=here,
-        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
-        capture_output=True,
-        text=True,
-        timeout=200.0,
-        check=False,
-    )
-    assert ended.returncode in (0, 3), ended.stderr
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    ended = spawned("-P", "-c", program, *arguments, cwd=here, env=environment)  # as the console script does
+    assert ended.status in (0, 3), ended.err
     assert not (tmp_path / "run").exists()
     if command == "report":
         assert "There are no pictures" not in (tmp_path / "page.html").read_text()
@@ -94,16 +86,8 @@ def test_python_files_in_the_current_folder_are_not_run(scene: Path, built: Path
 
 def test_python_files_in_the_current_folder_are_not_run_by_the_module(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "numpy.py").write_text("raise SystemExit('it is run')")
-    ended = subprocess.run(
-        [sys.executable, "-m", "modeler", "info", str(scene)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(modeler.__file__).parent.parent)},
-        capture_output=True,
-        text=True,
-        timeout=100.0,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stderr
+    ended = spawned("info", scene, cwd=tmp_path, settings={"PYTHONPATH": str(Path(modeler.__file__).parent.parent)})
+    assert ended.status == 0, ended.err
 
 
 def test_links_in_a_run_folder_are_replaced_and_not_followed(tmp_path: Path) -> None:
@@ -142,53 +126,45 @@ def linked(tmp_path: Path, inner: str) -> tuple[Path, Path]:
 
 @pytest.mark.parametrize("name", ["model.ply", "robot.txt", "sequence.json"])
 def test_what_lies_beside_the_frames_may_be_refused_where_it_is_a_link_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+    tmp_path: Path, refusal: Callable[..., str], name: str
 ) -> None:
     folder, _ = linked(tmp_path, name)
-    assert main(["convert", str(folder), "--out", str(tmp_path / "out"), "--strict-paths"]) == 2
-    assert "leads out of the sequence" in capsys.readouterr().err
+    assert "leads out of the sequence" in refusal("convert", folder, "--out", tmp_path / "out", "--strict-paths")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("inner", ["depth", "depth/000000.png", "scene_camera.json"])
 def test_nothing_is_written_where_a_link_of_a_sequence_leads(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], inner: str
+    tmp_path: Path, refusal: Callable[..., str], inner: str
 ) -> None:
     folder, outside = linked(tmp_path, inner)
     assert main(["build", str(folder), "--out", str(tmp_path / "run"), *QUICK]) == 0
     held = {path: path.read_bytes() for path in (tmp_path / "elsewhere").rglob("*") if path.is_file()}
-    capsys.readouterr()
     out = outside / "000000.png" if outside.is_dir() else outside
-    assert main(["report", str(tmp_path / "run"), "--out", str(out), "--overwrite"]) == 2
-    assert "only read" in capsys.readouterr().err
+    assert "only read" in refusal("report", tmp_path / "run", "--out", out, "--overwrite")
     if outside.is_dir():
-        assert main(["convert", str(folder), "--out", str(outside / "new")]) == 2
-        assert main(["build", str(folder), "--out", str(outside / "new"), *QUICK]) == 2
+        refusal("convert", folder, "--out", outside / "new")
+        refusal("build", folder, "--out", outside / "new", *QUICK)
     assert {path: path.read_bytes() for path in (tmp_path / "elsewhere").rglob("*") if path.is_file()} == held
 
 
-def test_what_is_said_does_not_steer_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_said_does_not_steer_the_terminal(tmp_path: Path, refusal: Callable[..., str]) -> None:
     write_open3d(tmp_path / "in", small_frames(2))
     (tmp_path / "in" / "sequence.json").write_text(json.dumps({"name": "\x1b[2Jcup"}))
-    assert main(["info", str(tmp_path / "in")]) == 2
-    said = capsys.readouterr().err
+    said = refusal("info", tmp_path / "in")
     assert "printable" in said
     (tmp_path / "in" / "sequence.json").unlink()
     (tmp_path / "in" / "depth" / "\x1b[2J.png").write_text("")
-    assert main(["info", str(tmp_path / "in")]) == 2
-    said += capsys.readouterr().err
-    assert main(["info", str(tmp_path / "\x1b[2J")]) == 2
-    said += capsys.readouterr().err
+    said += refusal("info", tmp_path / "in") + refusal("info", tmp_path / "\x1b[2J")
     assert said.replace("\n", "").isprintable()
-    assert said.count("\n") == 3
 
 
-def test_names_that_are_no_text_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_that_are_no_text_are_refused(tmp_path: Path, refusal: Callable[..., str]) -> None:
     """A path on Linux is bytes; what is not UTF-8 in it comes as lone surrogates, which the viewer does not take."""
     write_bop(tmp_path / "in", small_frames(2))
-    assert main(["info", str(tmp_path / "cup \udcff")]) == 2
-    assert main(["build", str(tmp_path / "in"), "--out", str(tmp_path / "run \udcff"), *QUICK]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == said.count("is not UTF-8; rename") == 2
-    assert said.count("\\udcff") == 2
+    out = ("--out", tmp_path / "run \udcff")
+    for command in (("info", tmp_path / "cup \udcff"), ("build", tmp_path / "in", *out, *QUICK)):
+        said = refusal(*command)
+        assert "is not UTF-8; rename" in said
+        assert "\\udcff" in said
     assert [path.name for path in tmp_path.iterdir()] == ["in"]

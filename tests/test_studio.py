@@ -18,7 +18,6 @@ import pytest
 
 pytest.importorskip("nicegui", reason="needs the extra studio")
 
-from command_runner import Run
 from scipy.spatial.transform import Rotation
 from studio_server import Server, served
 
@@ -459,14 +458,9 @@ def test_a_server_that_is_interrupted_ends_in_order(scene: Path, tmp_path: Path)
     assert json.loads((tmp_path / "studio" / "box" / "scan.json").read_text())["sequence"] == str(scene)
 
 
-def test_wrong_use_is_told_in_a_line(cli: Run, tmp_path: Path, scene: Path) -> None:
-    ended = cli("studio", tmp_path / "none", "--out", tmp_path / "studio")
-    assert ended.status == 2
-    assert "no such folder" in ended.err
-    ended = cli("studio", scene, "--out", scene / "studio")
-    assert ended.status == 2
-    assert "only read" in ended.err
-    ended = cli("studio", scene, "--out", tmp_path / "studio", "--port", "99999")
-    assert ended.status == 2
-    assert "--port 99999" in ended.err
+def test_wrong_use_is_told_in_a_line(refusal: Callable[..., str], tmp_path: Path, scene: Path) -> None:
+    out = ("--out", tmp_path / "studio")
+    assert "no such folder" in refusal("studio", tmp_path / "none", *out)
+    assert "only read" in refusal("studio", scene, "--out", scene / "studio")
+    assert "--port 99999" in refusal("studio", scene, *out, "--port", "99999")
     assert list(scene.glob("studio")) == []

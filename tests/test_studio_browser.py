@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from studio_server import EXECUTABLE, FLAGS, Server, end, needs_browser, served
+from chromium import needs_chromium, started
+from studio_server import Server, end, served
 
 from modeler.export import RunFolder
 from modeler.sequences import write_bop
 from studies.formats.image_folders import small_frames
 
 pytest.importorskip("nicegui", reason="needs the extra studio")
-sync_api = pytest.importorskip("playwright.sync_api", reason="needs Playwright")
-pytestmark = [needs_browser, pytest.mark.slow]
+pytestmark = [needs_chromium, pytest.mark.slow]
 CAPTURES = Path(__file__).parents[1].parent / "shared" / "data"
 PATIENCE_MS = 90_000
 STEPS = ("Files", "Capture", "Object", "Build", "Check", "Take away", "Scans")
@@ -46,10 +46,8 @@ _FAINT = """() => {
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=str(EXECUTABLE), args=[*FLAGS])
+    with started() as running:
         yield running
-        running.close()
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -67,10 +68,8 @@ def test_a_goal_decides_the_status(cli: Run, built: Path) -> None:
 @pytest.mark.parametrize(
     "options", [("--until-seen", "1.5"), ("--until-seen", "0"), ("--until-sigma-mm", "nan"), ("--until-pose-deg", "-1")]
 )
-def test_goals_out_of_range_are_refused_in_a_line(cli: Run, built: Path, options: tuple[str, str]) -> None:
-    ended = cli("suggest", built, *options)
-    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert options[0] in ended.err
+def test_goals_out_of_range_are_refused(refusal: Callable[..., str], built: Path, options: tuple[str, str]) -> None:
+    assert options[0] in refusal("suggest", built, *options)
 
 
 def test_poses_may_come_as_a_table(tmp_path: Path) -> None:

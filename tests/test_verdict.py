@@ -113,6 +113,25 @@ def joined(source: int, target: int, poses: Mapping[int, Array], *, kind: Any = 
     return Edge(replace(posterior, **changes), kind, True, Stated("made up"))
 
 
+def last_step(views: dict[int, RayImage], edges: tuple[Edge, ...], records: list[FrameRecord], **changes: Any) -> Step:
+    """The last step of a run."""
+    newest = views[max(views)]
+    step = Step(
+        frame=newest.frame,
+        segmentation=Segmentation(newest.frame.mask, None, Outcome.CONVERGED),  # pyright: ignore[reportArgumentType]
+        view=newest,
+        posteriors=(),
+        edges=(),
+        left_out=None,
+        solution=solve(PoseGraph(edges=edges, first=0), {}),
+        edges_so_far=edges,
+        views=views,
+        frames_so_far=tuple(records),
+        last=True,
+    )
+    return replace(step, **changes)
+
+
 STEPS_DEG = [0.0, 25.0, 50.0, 75.0]
 LONGER_DEG = [1.01 * angle_deg for angle_deg in STEPS_DEG]
 
@@ -351,10 +370,8 @@ def test_a_pose_that_is_wrong_with_more_than_five_percent_speaks_against_a_model
     for sigma_deg, sigma_m, turn_holds, place_holds in ((1.4, 0.002, True, True), (1.6, 0.003, False, False)):
         spread = ABOUT_OBJECT + np.diag([0.0, np.radians(sigma_deg) ** 2, 0.0, 0.0, 0.0, sigma_m**2])
         away = {frame: se3.adjoint(se3.translation(view.centroid_m)) for frame, view in views.items()}
-        solution = Solution(
-            poses,
-            {frame: away[frame] @ (spread if frame == 2 else ABOUT_OBJECT) @ away[frame].T for frame in poses},
-        )
+        about = {frame: spread if frame == 2 else ABOUT_OBJECT for frame in poses}
+        solution = Solution(poses, {frame: away[frame] @ about[frame] @ away[frame].T for frame in poses})
         spread_from_first = AboutMean.of(solution)  # no joint covariance is known
         turn = spread_of_rotations(spread_from_first)
         place = spread_of_positions(views, solution, spread_from_first, 0.005)
@@ -408,29 +425,10 @@ def whole_run(
         edges = (*edges, replace(joined(len(views) - 1, 0, poses, kind="closure"), accepted=False, reason=refused))
     masks = [Outcome.UNSURE_MASK if index < unsure else Outcome.CONVERGED for index in views]
     frames = [FrameRecord(k, float(k), 100, "accepted", mask=mask.label) for k, mask in enumerate(masks)]
-    newest = views[len(views) - 1]
-    assert newest.frame.mask is not None
-    step = Step(
-        frame=newest.frame,
-        segmentation=Segmentation(newest.frame.mask, None, masks[-1]),
-        view=newest,
-        posteriors=(),
-        edges=(),
-        left_out=None,
-        solution=solve(PoseGraph(edges=edges, first=0), {}, focal=focal),
-        edges_so_far=edges,
-        views=views,
-        frames_so_far=tuple(frames),
-        last=last,
-        make_model=ball,
-    )
-    verdict = judged(
-        step,
-        prior=prior,
-        closure_expected=expected,
-        depth_scale_sigma=depth_scale_sigma,
-        tolerance_m=0.005,
-    )
+    solution = solve(PoseGraph(edges=edges, first=0), {}, focal=focal)
+    step = last_step(views, edges, frames, solution=solution, last=last, make_model=ball)
+    known = {"prior": prior, "closure_expected": expected, "depth_scale_sigma": depth_scale_sigma}
+    verdict = judged(step, **known, tolerance_m=0.005)
     assert verdict.trustworthy == (not verdict.reasons)
     return list(verdict.codes), {name: check.holds for name, check in verdict.checks.items()}
 
@@ -466,61 +464,39 @@ def test_how_far_a_body_of_revolution_turned_is_no_matter_of_its_model(
 def test_a_sound_run_is_trusted_and_shows_its_evidence() -> None:
     codes, holds = whole_run(STEPS_DEG, prior=TurntablePrior(-25.0))
     assert codes == []
-    assert holds == dict.fromkeys(
-        (
-            "unsure_masks",
-            "motion_m",
-            "prior_sds",
-            "prior_chi2",
-            "free_space_violations",
-            "false_surface",
-            "other_modes",
-            "flat_frames",
-            "pose_sd_deg",
-            "pose_sd_m",
-        ),
-        True,
-    )
-
-
-@pytest.mark.parametrize(
-    ("angles_deg", "unsure", "prior", "codes"),
-    [
-        (STEPS_DEG, 2, None, []),
-        (STEPS_DEG, 3, None, ["unsure_masks"]),
-        ([0.0, 0.1, 0.0, 0.1], 0, None, ["no_motion"]),
-        (STEPS_DEG, 0, TurntablePrior(25.0, axis_direction=UP), ["prior_contradicted"]),
-        ([0.0] * 4, 0, TurntablePrior(25.0), ["no_motion", "prior_contradicted"]),
-    ],
-)
-def test_each_fault_of_a_run_has_its_code(
-    angles_deg: list[float], unsure: int, prior: AbstractPrior | None, codes: list[str]
-) -> None:
-    assert whole_run(angles_deg, unsure=unsure, prior=prior)[0] == codes
+    evidence = "unsure_masks motion_m prior_sds prior_chi2 free_space_violations false_surface other_modes flat_frames"
+    assert holds == dict.fromkeys([*evidence.split(), "pose_sd_deg", "pose_sd_m"], True)
 
 
 TURN_DEG = [30.0 * k for k in range(13)]
 CONTRADICTS = Consistency(7.1, 4.7, 25.1, 0.018, 1.0, 0.05)
 
 
+FAR_APART = LowOverlap(0.2, 0.4)
+
+
 @pytest.mark.parametrize(
-    ("angles_deg", "refused", "expected", "codes"),
+    ("angles_deg", "how", "codes"),
     [
-        (TURN_DEG[:9], None, False, []),
-        (TURN_DEG[:9], None, True, ["never_came_back"]),
-        (TURN_DEG[:12], None, False, ["not_tried"]),  # 30° from the first view
-        (TURN_DEG, CONTRADICTS, False, ["closures_refused"]),
-        (TURN_DEG, LowOverlap(0.2, 0.4), False, ["closures_refused"]),
-        (TURN_DEG[:11], LowOverlap(0.2, 0.4), False, []),  # 60° apart: surface in common is not to be expected
-        (TURN_DEG[:11], Failed(Outcome.NO_OVERLAP), False, []),
-        (TURN_DEG[:11], Failed(Outcome.NO_OVERLAP), True, ["closures_refused"]),
-        (TURN_DEG[:11], CONTRADICTS, False, ["closures_refused"]),
+        (STEPS_DEG, {"unsure": 2}, []),
+        (STEPS_DEG, {"unsure": 3}, ["unsure_masks"]),
+        ([0.0, 0.1, 0.0, 0.1], {}, ["no_motion"]),
+        (STEPS_DEG, {"prior": TurntablePrior(25.0, axis_direction=UP)}, ["prior_contradicted"]),
+        ([0.0] * 4, {"prior": TurntablePrior(25.0)}, ["no_motion", "prior_contradicted"]),
+        # Where a turn may be complete, a loop must have been tried.
+        (TURN_DEG[:9], {}, []),
+        (TURN_DEG[:9], {"expected": True}, ["never_came_back"]),
+        (TURN_DEG[:12], {}, ["not_tried"]),  # 30° from the first view
+        (TURN_DEG, {"refused": CONTRADICTS}, ["closures_refused"]),
+        (TURN_DEG, {"refused": FAR_APART}, ["closures_refused"]),
+        (TURN_DEG[:11], {"refused": FAR_APART}, []),  # 60° apart: surface in common is not to be expected
+        (TURN_DEG[:11], {"refused": Failed(Outcome.NO_OVERLAP)}, []),
+        (TURN_DEG[:11], {"refused": Failed(Outcome.NO_OVERLAP), "expected": True}, ["closures_refused"]),
+        (TURN_DEG[:11], {"refused": CONTRADICTS}, ["closures_refused"]),
     ],
 )
-def test_where_a_turn_may_be_complete_a_loop_must_have_been_tried(
-    angles_deg: list[float], refused: Reason | None, expected: bool, codes: list[str]
-) -> None:
-    assert whole_run(angles_deg, refused=refused, expected=expected)[0] == codes
+def test_each_fault_of_a_run_has_its_code(angles_deg: list[float], how: dict[str, Any], codes: list[str]) -> None:
+    assert whole_run(angles_deg, **how)[0] == codes
 
 
 def test_evidence_is_gathered_once_all_edges_are_in() -> None:
@@ -534,26 +510,11 @@ def test_two_segments_need_two_pairs_that_join_them_and_what_is_between_them_cou
     poses = dict(zip(numbers, poses_of(angles_deg).values(), strict=True))
     chain = [joined(k, k - 1, poses) for k in (1, 2, 5, 6)]
     joins = [joined(4, 1, poses, kind="join"), joined(5, 2, poses, kind="join")]
-    newest = views[6]
-    assert newest.frame.mask is not None
     for count, lost, expected in ((2, 3, set()), (1, 3, {"unconfirmed"}), (2, 7, {"left_out"})):
         edges = (*chain, *joins[:count])
-        step = Step(
-            frame=newest.frame,
-            segmentation=Segmentation(newest.frame.mask, None, Outcome.CONVERGED),
-            view=newest,
-            posteriors=(),
-            edges=(),
-            left_out=None,
-            solution=solve(PoseGraph(edges=edges, first=0), {}),
-            edges_so_far=edges,
-            views=views,
-            frames_so_far=(
-                *(FrameRecord(k, float(k), 100, "accepted") for k in numbers),
-                FrameRecord(lost, float(lost), 0, "a hand", cause="no overlap"),
-            ),
-            last=True,
-        )
+        records = [FrameRecord(k, float(k), 100, "accepted") for k in numbers]
+        records.append(FrameRecord(lost, float(lost), 0, "a hand", cause="no overlap"))
+        step = last_step(views, edges, records)
         # Steps of 25° where the motion was known, and none of the joins is one.
         verdict = judged(step, prior=TurntablePrior(-25.0, axis_direction=UP), tolerance_m=0.005)
         assert {*verdict.codes} == expected
