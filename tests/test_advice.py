@@ -15,7 +15,7 @@ from modeler import priors, se3
 from modeler.cli.build import Build
 from modeler.cli.console import _options
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
-from modeler.types import AbstractPrior, Outcome
+from modeler.types import ACCEPTED, AbstractPrior, Outcome
 from modeler.verdict.advice import estimated_focal_length, remedies, unchecked_focal_length
 
 
@@ -32,7 +32,12 @@ def untrusted(
     edge |= {"outcome": outcome.label, "target_from_source": turn.ravel().tolist()}
     edge["covariance"] = (np.radians(sigma_deg) ** 2 * np.eye(6)).ravel().tolist()
     edge["modes"] = [{"weight": 1.0, "weight_in_graph": None}]
-    frames = [{"id": 0, "cause": ""}, {"id": 1, "cause": "" if edge["accepted"] else outcome.label}]
+    frames = [
+        {"id": 0, "cause": "", "outcome": ACCEPTED},
+        {"id": 1, "cause": "", "outcome": ACCEPTED}
+        if edge["accepted"]
+        else {"id": 1, "cause": outcome.label, "outcome": outcome.advice},
+    ]
     return {"reason_codes": list(codes), "frames": frames, "edges": [edge], "closed": False, **more}
 
 
@@ -119,6 +124,29 @@ def test_surface_that_is_not_there_leads_to_the_masks_where_a_loop_confirms_the_
     (found,) = remedies(report, priors.GeneralPrior())
     assert found.first.startswith(first)
     assert bool(found.parameters) is not closed
+
+
+@pytest.mark.parametrize(
+    ("codes", "frames", "lost", "contradicted", "dropped"),
+    [
+        (("free_space_violations", "false_surface"), 12, (), (3, 7), "3,7"),
+        (("left_out",), 12, (5,), (), "5"),
+        (("left_out", "false_surface"), 12, (5,), (3,), "3,5"),
+        (("false_surface",), 12, (), (1, 2, 3, 4), None),  # more than a quarter
+        (("left_out", "other_modes"), 12, (5,), (), None),  # others may be wrong
+        ((), 12, (5,), (), None),  # between two segments
+    ],
+)
+def test_few_frames_that_are_lost_or_contradict_others_can_be_taken_out(
+    codes: tuple[str, ...], frames: int, lost: tuple[int, ...], contradicted: tuple[int, ...], dropped: str | None
+) -> None:
+    records = [
+        {"id": k, "outcome": "no overlap" if k in lost else ACCEPTED, "cause": "no overlap" if k in lost else ""}
+        for k in range(frames)
+    ]
+    report = untrusted(*codes, contradicted={str(k): {} for k in contradicted}) | {"frames": records}
+    first = [one.first for one in remedies(report, priors.GeneralPrior()) if "edit" in one.first]
+    assert first == ([] if dropped is None else [f"modeler edit {{run}} `drop` {dropped} `out` {{run}}_edited"])
 
 
 def test_a_size_that_is_not_known_has_a_remedy_of_its_own() -> None:

@@ -50,6 +50,31 @@ def test_a_frame_is_taken_out_and_the_others_stay_where_they_were(cli: Run, buil
     assert reopened(tmp_path / "new").views.keys() == after.keys()
 
 
+def test_a_run_is_as_certain_when_it_is_opened_again(built: Path) -> None:
+    """Edited, joined and continued runs are judged by the same covariances as those of `modeler build`."""
+    run = reopened(built)
+    for pose in run.report["poses"]:
+        covariance = np.reshape(pose["covariance"], (6, 6))
+        np.testing.assert_allclose(run.solution.covariances[pose["id"]], covariance, rtol=1e-3, atol=1e-12)
+    camera = run.report["camera"]
+    assert run.solution.focal is not None
+    assert run.solution.focal.sigma == camera["focal_factor_sigma"] > 0.0
+
+
+def test_a_frame_that_was_left_out_can_be_taken_out(cli: Run, built: Path, tmp_path: Path) -> None:
+    run = built.parent / "with_lost"  # beside it, as it names its sequence by a relative path
+    shutil.copytree(built, run)
+    report = json.loads((run / "report.json").read_text())
+    lost = report["frames"][-1] | {"id": 99, "outcome": "no overlap", "cause": "no_overlap", "points": 0}
+    report["frames"].append(lost)
+    (run / "report.json").write_text(json.dumps(report))
+    cli("edit", run, "--drop", "99", "--out", tmp_path / "new")
+    after = json.loads((tmp_path / "new" / "report.json").read_text())
+    assert [frame["id"] for frame in after["frames"]] == [frame["id"] for frame in report["frames"][:-1]]
+    assert "left_out" not in after["reason_codes"]
+    assert poses(tmp_path / "new").keys() == poses(built).keys()
+
+
 def test_what_is_kept_is_what_is_not_dropped(cli: Run, built: Path, tmp_path: Path) -> None:
     frames = sorted(poses(built))
     some = ",".join(map(str, frames[:-1]))
@@ -76,7 +101,7 @@ def test_a_run_may_be_edited_in_place(cli: Run, built: Path, tmp_path: Path) -> 
     [
         ((), "--drop"),
         (("--drop", "1", "--keep", "2"), "--keep"),
-        (("--drop", "99"), "frame 99 is not in the model"),
+        (("--drop", "99"), "frame 99 is not in the run"),
         (("--drop", "one"), "'one' is no list of frames"),
         (("--keep", "0"), "keep at least 2"),
         (("--keep", "0:99"), "no frame would be taken out"),

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from modeler.cli.console import say, trusted_status
+from modeler.cli.console import as_options, say, trusted_status
 from modeler.composition.options import SEED, default
+
+if TYPE_CHECKING:
+    from modeler.types import Verdict
 
 
 @dataclass(frozen=True)
 class Edit:
-    """Take frames out of a finished run, and optimise and fuse the rest without registering again."""
+    """Take frames out of a finished run, and optimise and fuse the rest without registering again.
+
+    Frames that the run left out can be taken out as well: the verdict is then on those that are left.
+    """
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Run folder of `modeler build` or `modeler join`."""
@@ -30,14 +37,14 @@ class Edit:
 
     def run(self) -> int:
         """Edit the run; status 3 if the result cannot be trusted; report.json has the reasons."""
-        from modeler.export import RunFolder, poses_of
+        from modeler.export import RunFolder
         from modeler.runs.joining import edit
         from modeler.runs.outputs import check_run_folder, run_inputs
         from modeler.types import InputError
 
         if (self.drop is None) == (self.keep is None):
             raise InputError("give the frames to take out with --drop, or those to keep with --keep")
-        frames = sorted(poses_of(RunFolder(self.run_folder).result()))
+        frames = sorted(record["id"] for record in RunFolder(self.run_folder).result()["frames"])
         chosen = _numbers(self.drop or self.keep or "", frames)
         dropped = chosen if self.keep is None else [frame for frame in frames if frame not in chosen]
         out = self.out or self.run_folder
@@ -52,7 +59,7 @@ class Edit:
         say(f"{len(dropped)} of {len(frames)} frames taken out, {left} left: {out}")
         if unconnected:
             say(f"left out, too, as nothing else joins them to the rest: {', '.join(map(str, unconnected))}")
-        return trusted_status(verdict)
+        return _ended(report, verdict, out)
 
 
 def _numbers(text: str, frames: Sequence[int]) -> list[int]:
@@ -106,7 +113,19 @@ class Join:
         say(f"models aligned: {100.0 * best.share:.3g} % likely{ways}")
         frames = len(report["poses"])
         say(f"{best.accepted} of {len(best.edges)} pairs registered, {frames} frames joined: {self.out}")
-        return trusted_status(verdict)
+        return _ended(report, verdict, self.out)
+
+
+def _ended(report: Mapping[str, Any], verdict: Verdict, out: Path) -> int:
+    """Say why a model is not to be trusted and what can be done without another build; return the exit status."""
+    from modeler.priors import GeneralPrior
+    from modeler.verdict.advice import remedies
+
+    status = trusted_status(verdict)
+    for remedy in remedies(report, GeneralPrior()):
+        if not remedy.parameters:
+            say(as_options(f"{remedy.words}: {remedy.first.format(run=shlex.quote(str(out)))}"))
+    return status
 
 
 def _check(options: Join) -> None:

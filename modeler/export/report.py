@@ -123,9 +123,9 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
 def _camera(
     given: Mapping[str, float | str] | None, solution: Solution, views: Mapping[int, RayImage]
 ) -> dict[str, Any] | None:
-    """Return the estimate of the camera; None if the given one is exact."""
+    """Return the estimate of the camera; None if the given one is exact. That of an earlier run of its views stays."""
     focal = solution.focal
-    if focal is None:
+    if focal is None or (given is not None and "factor_in_run" in given):
         return None if given is None else dict(given)
     before = {"focal_factor": 1.0, "depth_scale": 1.0, "depth_scale_sigma": 0.0} if given is None else given
     in_run = math.exp(focal.log_factor)

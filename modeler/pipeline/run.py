@@ -13,7 +13,7 @@ import numpy as np
 
 from modeler.closure import Placement
 from modeler.fusion import conditional_covariances, widened
-from modeler.graph import MovingGraph, estimate_focal_length, shared_noise, variance_factor
+from modeler.graph import MovingGraph, estimate_focal_length
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.correcting import (
     LEAST_TURN_DEG,
@@ -382,25 +382,19 @@ class Run:
         return self._step(placed.prepared, placed.posteriors, placed.edges)
 
     def _solve(self) -> None:
-        """Solve the graph with what its edges share: an axis of all steps or else noise, and the focal length.
+        """Solve the graph with what its edges share, see `State.with_shared_errors`.
 
-        The axis is estimated from all pairs, so that it makes the first pairs as precise as the last, and each pair
-        informs it once. Noise is shared by the edges of a frame and by all views. If loops determine the focal length,
-        views and edges are converted to its estimate.
+        If loops determine the focal length, views and edges are converted to its estimate.
         """
         if self.state is self._solved:
             return
         state, focal = self.state.with_spans(), None
         if (sigma := self.modeler.sensor.noise.sigma_focal) > 0.0 and len(state.solution.trajectory) > 1:
             state, focal = self._with_focal_length(state, sigma)
-        distance_sigma = self.modeler.common_distance if sigma > 0.0 else 0.0
-        solved = partial(state.solved, focal=focal, distance_sigma=distance_sigma)
-        if (about_axis := solved().about_axis(self.modeler.prior)) is not None:
-            self.state = self._solved = about_axis
-            return
-        factor = variance_factor(state.graph, state.solution, state.exact_share)
-        shared = shared_noise(state.graph, state.solution, factor)
-        self.state = self._solved = solved(shared=shared, common=self.modeler.common_noise, variance_factor=factor)
+        parts = self.modeler
+        self.state = self._solved = state.with_shared_errors(
+            parts.prior, focal=focal, common_noise=parts.common_noise, common_distance=parts.common_distance
+        )
 
     def _with_focal_length(self, state: State, sigma: float) -> tuple[State, FocalLength]:
         """Return a state under the focal length estimated from its loops, and the estimate.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from modeler import se3
 from modeler.closure import MapView, PathNetwork
-from modeler.graph import CommonAxis, PoseGraph, Smoother
+from modeler.graph import CommonAxis, PoseGraph, Smoother, shared_noise, variance_factor
 from modeler.pipeline.pairs import Prepared
 from modeler.registration.posterior import of_multipath
 from modeler.system.disk_arrays import ViewStore
@@ -277,6 +277,33 @@ class State:
             variance_factor=variance_factor,
         )
         return replace(self, smoother=smoother.to(self.graph))
+
+    def with_shared_errors(
+        self,
+        prior: AbstractPrior | None,
+        *,
+        focal: FocalLength | None,
+        common_noise: float,
+        common_distance: float,
+    ) -> State:
+        """Return the state solved with what its edges share: an axis of all steps or else noise, and the focal length.
+
+        The axis is estimated from all pairs, so that it makes the first pairs as precise as the last, and each pair
+        informs it once. Noise is shared by the edges of a frame and by all views.
+
+        Args:
+            prior: of the steps; None: they share no axis.
+            focal: estimate of the focal length; None: it is exact, and so are distances.
+            common_noise: see `Modeler`.
+            common_distance: see `Modeler`.
+        """
+        solved = partial(self.solved, focal=focal, distance_sigma=common_distance if focal is not None else 0.0)
+        about_axis = None if prior is None else solved().about_axis(prior)
+        if about_axis is not None:
+            return about_axis
+        factor = variance_factor(self.graph, self.solution, self.exact_share)
+        shared = shared_noise(self.graph, self.solution, factor)
+        return solved(shared=shared, common=common_noise, variance_factor=factor)
 
     def about_axis(self, prior: AbstractPrior) -> State | None:
         """Return the state solved with the axis that all steps share by a prior; None if they share none, or none fits.

@@ -13,13 +13,13 @@ import numpy as np
 from modeler import se3
 from modeler.composition.options import ObjectOptions
 from modeler.export import RunFolder, RunMeta
-from modeler.graph import PoseGraph, solve
+from modeler.graph import PoseGraph
 from modeler.pipeline.joining import Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
 from modeler.runs.joining import Work, groups_of, later_s, sequences_of, stated_tolerance, write_run
 from modeler.runs.known_objects import known_object
-from modeler.runs.reopening import Part, Reopened, reopened
+from modeler.runs.reopening import Part, Reopened, reopened, solved
 from modeler.sequences import AbstractSequence, Overrides
 from modeler.sequences.calibrated import has_focal
 from modeler.tracking import Tracked, Tracker
@@ -118,7 +118,8 @@ class Growth:
             camera=before.report.get("camera"),
         )  # fmt: skip
         graph = PoseGraph(edges=edges, first=min(poses))
-        solution = solve(graph, {k: pose for k, pose in {**poses, **placed}.items() if k in kept})
+        guess = {k: pose for k, pose in {**poses, **placed}.items() if k in kept}
+        solution = solved(edges, guess, {**before.views, **views_kept}, meta.camera)
         shown = [edge for edge in edges if edge.source in views_kept and edge.target in before.views]
         work = Work((before, second), graph, solution, shown, began_s)
         _, verdict = write_run(out, work, meta, overwrite=overwrite)

@@ -15,11 +15,11 @@ from modeler import se3
 from modeler.composition.compose import comes_back
 from modeler.export import RunFolder, RunMeta, locked
 from modeler.fusion import Fuser, conditional_covariances, widened
-from modeler.graph import PoseGraph, solve
+from modeler.graph import PoseGraph
 from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
-from modeler.runs.reopening import Part, Reopened, renumbered, reopened
+from modeler.runs.reopening import Part, Reopened, renumbered, reopened, solved
 from modeler.types import Edge, FrameRecord, InputError, Outcome, RayImage, Segmentation, Solution, Step, Verdict
 from modeler.verdict import judged
 from modeler.viz.stream import open_stream
@@ -78,7 +78,8 @@ def join(
         camera=_least_known([*first.parts, *second.parts]),
     )
     shown = [edge for edge in graph.edges if edge.source in second.views and edge.target in first.views]
-    work = Work((first, second), graph, solve(graph, guess), shown, began_s)
+    views = {**first.views, **second.views}
+    work = Work((first, second), graph, solved(edges, guess, views, meta.camera), shown, began_s)
     return alignments, *write_run(out, work, meta, overwrite=overwrite)
 
 
@@ -250,7 +251,7 @@ def edit(
 
     Args:
         run: run folder.
-        dropped: numbers of frames of its model.
+        dropped: numbers of frames, of its model or left out.
         out: run folder to create; the run's own, to replace it.
         overwrite: whether another run there may be replaced.
 
@@ -260,10 +261,9 @@ def edit(
     began_s = time.perf_counter()
     before = reopened(run)
     poses = before.solution.trajectory
-    if unknown := sorted(set(dropped) - poses.keys()):
-        raise InputError(
-            f"{run}: frame {unknown[0]} is not in the model; its frames are {', '.join(map(str, sorted(poses)))}"
-        )
+    frames = sorted(record["id"] for record in before.report["frames"])
+    if unknown := sorted({*dropped} - {*frames}):
+        raise InputError(f"{run}: frame {unknown[0]} is not in the run; its frames are {', '.join(map(str, frames))}")
     rest = {frame: pose for frame, pose in poses.items() if frame not in dropped}
     if len(rest) < 2:
         raise InputError(f"{run}: of its {len(poses)} frames {len(rest)} would be left; keep at least 2")
@@ -274,8 +274,9 @@ def edit(
     edges = tuple(edge for edge in before.edges if {edge.source, edge.target} <= joined)
     first = min(joined)
     graph, first_from_object = PoseGraph(edges, first), se3.inverse(rest[first])  # the first camera's is the object's
-    solution = solve(graph, {frame: first_from_object @ rest[frame] for frame in sorted(joined)})
-    part = _without(before, {*dropped, *unconnected})
+    guess = {frame: first_from_object @ rest[frame] for frame in sorted(joined)}
+    part, expected = _without(before, {*dropped, *unconnected}), _expected(before)
+    solution = solved(edges, guess, part.views, before.report.get("camera"), expected.get("prior"))
     report, settings = before.report, dict(before.report["settings"])
     made = RunFolder(out)
     for name in {"sensor", "camera", "continues"} & settings.keys():
@@ -286,7 +287,7 @@ def edit(
     sequence = " + ".join(sequences_of(run, before, out))
     meta = RunMeta(sequence, report["seed"], report["prior"], settings, report.get("camera"))
     same, work = out.resolve() == run.resolve(), Work((part,), graph, solution, edges, began_s)
-    done = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **_expected(before))
+    done = write_run(out, work, meta, overwrite=overwrite and not same, resume=same, **expected)
     return *done, unconnected
 
 

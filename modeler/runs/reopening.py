@@ -14,9 +14,10 @@ from modeler.composition import compose
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, edges_of, poses_of
 from modeler.fusion import Fuser, FusionVolume, conditional_covariances, widened
-from modeler.graph import MovingGraph, PoseGraph, solve
+from modeler.graph import MovingGraph, PoseGraph, Smoother
 from modeler.pipeline import Modeler
 from modeler.pipeline.pairs import SEGMENTED
+from modeler.pipeline.state import State
 from modeler.segmentation import Scene, scene_frames
 from modeler.sequences import (
     AbstractSequence,
@@ -27,7 +28,7 @@ from modeler.sequences import (
     read_focal_factor,
     read_noise,
 )
-from modeler.types import ACCEPTED, Array, BoolArray, Edge, InputError, ObjectModel, RayImage, Solution
+from modeler.types import ACCEPTED, AbstractPrior, Array, BoolArray, Edge, InputError, ObjectModel, RayImage, Solution
 from modeler.views import Sensor
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)
@@ -248,12 +249,7 @@ class Reopened:
 
     def model(self, volume: FusionVolume, *, watertight: bool = False) -> ObjectModel:
         """Return the model of its volume, whose vertices are as uncertain as those of `modeler build`."""
-        sigma = (self.report.get("camera") or {}).get("focal_factor_sigma")
-        if not sigma or not self.solution.covariances:
-            return widened(volume.model(watertight=watertight), self.solution)
-        graph = PoseGraph(edges=self.edges, first=min(self.solution.trajectory))
-        focal = replace(MovingGraph.of(graph, self.solution).estimate(sigma), sigma=sigma)  # loops determined it
-        return widened(volume.model(watertight=watertight), replace(self.solution, focal=focal))
+        return widened(volume.model(watertight=watertight), self.solution)
 
 
 def reopened(run: Path, moved: Sequence[Path] = (), announce: Callable[[str], None] = lambda words: None) -> Reopened:
@@ -280,10 +276,35 @@ def reopened(run: Path, moved: Sequence[Path] = (), announce: Callable[[str], No
     if not poses.keys() <= views.keys():
         raise InputError(f"{run}: its parts have changed since they were joined; join them again")
     edges = edges_of(report)
-    return Reopened(parts[0].sequence.name, report, parts[0].sensor, views, edges, solved(edges, poses), parts)
+    prior = parts[0].modeler().prior if len(parts) == 1 else None
+    solution = solved(edges, poses, views, report.get("camera"), prior)
+    solution = replace(solution, trajectory={frame: poses[frame] for frame in solution.trajectory if frame in poses})
+    return Reopened(parts[0].sequence.name, report, parts[0].sensor, views, edges, solution, parts)
 
 
-def solved(edges: tuple[Edge, ...], poses: Mapping[int, Array]) -> Solution:
-    """Return the solution of edges, its poses where they were before."""
-    solution = solve(PoseGraph(edges=edges, first=min(poses)), poses)
-    return replace(solution, trajectory={frame: poses[frame] for frame in solution.trajectory if frame in poses})
+def solved(
+    edges: tuple[Edge, ...],
+    guess: Mapping[int, Array],
+    views: Mapping[int, RayImage],
+    camera: Mapping[str, Any] | None,
+    prior: AbstractPrior | None = None,
+) -> Solution:
+    """Return the solution of the edges of finished runs, as certain as `modeler build` takes it.
+
+    Args:
+        edges: all of them.
+        guess: object_from_camera (4, 4) by frame number; the first frame keeps its pose.
+        views: by frame number.
+        camera: its estimate by the runs, as in report.json, under which edges and views are; None: exact.
+        prior: of the steps, if all are of one run.
+    """
+    graph = PoseGraph(edges=edges, first=min(guess))
+    smoother = Smoother(solution=Solution(guess)).to(graph)
+    spans = tuple(edge for edge in edges if edge.kind == "span")
+    state = State(graph=graph, smoother=smoother, views=views, spans=spans)
+    focal, sigma = None, float((camera or {}).get("focal_factor_sigma", 0.0))
+    if sigma > 0.0 and len(smoother.solution.trajectory) > 1:
+        focal = MovingGraph.of(graph, smoother.solution).estimate(sigma)
+        focal = replace(focal, log_factor=0.0, sigma=sigma)  # loops determined it
+    parts = {"common_noise": Modeler.common_noise, "common_distance": Modeler.common_distance}
+    return state.with_shared_errors(prior, focal=focal, **parts).solution

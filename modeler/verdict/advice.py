@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import AutoPrior, GeneralPrior, TablePrior, TurntablePrior, turntable_in
-from modeler.types import AbstractPrior, Array, Failed, Outcome, Posterior, Reason, advice
+from modeler.types import ACCEPTED, AbstractPrior, Array, Failed, Outcome, Posterior, Reason, advice
 from modeler.verdict.evidence import MAX_UNSURE, WRONG_SHARE
 
 _SURE_STEPS: Final = 3  # least number of pairs for a measured step
@@ -19,6 +19,7 @@ _ROUGH: Final = (
     0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
 )
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method/search.md)
+_MOST_OUTLIERS: Final = 0.25  # of the frames: three agree for each that does not (by hand)
 _FAR_DEG: Final = 100.0  # 1 % of this rotation is 1°, a third of a wrong pose
 _BY_OPTIONS: Final = {
     Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, `roi` and `max_depth_m`.",
@@ -225,6 +226,8 @@ class Remedy:
 def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
     """Return what to do next about the first reason not to trust a model, and about its size if that is another.
 
+    If all that speaks against it is that few frames are left out or contradict the others, it can do without them.
+
     Args:
         report: of the run.
         prior: of the run.
@@ -248,7 +251,24 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
     found = ((code, by_code[code](report, prior)) for code in codes if code in by_code)
     first = [(code, each) for code, each in found if each is not None][:1]
     size = [_known_camera(report, prior)] if "unsure_size" in codes and first and first[0][0] != "unsure_size" else []
+    if (without := _without_frames(report)) is not None:
+        return [each for code, each in first if code == "left_out"] + [without]
     return [each for _, each in first] + size
+
+
+def _without_frames(report: Mapping[str, Any]) -> Remedy | None:
+    """Return how to take out frames that are left out or contradict others, if these are all that is wrong, and few."""
+    codes = {*(report.get("reason_codes") or ())}
+    frames = sorted(
+        {int(frame) for frame in report.get("contradicted") or ()}
+        | {frame["id"] for frame in report["frames"] if frame["outcome"] != ACCEPTED}
+    )
+    by_frames = bool(codes) and codes <= {"left_out", "free_space_violations", "false_surface"}
+    if not by_frames or not 0 < len(frames) <= _MOST_OUTLIERS * len(report["frames"]):
+        return None
+    out = ",".join(map(str, frames))
+    words = f"if the model can do without {'frame' if len(frames) == 1 else 'frames'} {out}, blurred or hidden perhaps"
+    return Remedy(words, first=f"modeler edit {{run}} `drop` {out} `out` {{run}}_edited")
 
 
 def _without_colour(report: Mapping[str, Any], prior: AbstractPrior) -> Remedy:

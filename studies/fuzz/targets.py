@@ -318,7 +318,7 @@ def _report(folder: Path) -> Path:
 
 def _reopen(path: Path) -> None:
     report = RunFolder(path).result()
-    solved(edges_of(report), {frame: pose.mean for frame, pose in poses_of(report).items()})
+    solved(edges_of(report), {frame: pose.mean for frame, pose in poses_of(report).items()}, {}, report.get("camera"))
 
 
 def _poses(path: Path) -> None:
