@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -276,10 +277,16 @@ def reopened(run: Path, moved: Sequence[Path] = (), announce: Callable[[str], No
     if not poses.keys() <= views.keys():
         raise InputError(f"{run}: its parts have changed since they were joined; join them again")
     edges = edges_of(report)
-    prior = parts[0].modeler().prior if len(parts) == 1 else None
-    solution = solved(edges, poses, views, report.get("camera"), prior)
+    solution = solved(edges, poses, views, report.get("camera"), _prior_of(parts))
     solution = replace(solution, trajectory={frame: poses[frame] for frame in solution.trajectory if frame in poses})
     return Reopened(parts[0].sequence.name, report, parts[0].sensor, views, edges, solution, parts)
+
+
+def _prior_of(parts: Sequence[Part]) -> AbstractPrior | None:
+    """Return the prior of a run; None if it joins several, or was not made with one that options name."""
+    with contextlib.suppress(InputError):
+        return parts[0].modeler().prior if len(parts) == 1 else None
+    return None
 
 
 def solved(
