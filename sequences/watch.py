@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 END = "done"  # a file of this name in the folder marks the end of the sequence
 POLL_S = 0.05  # polling interval of the folder
 REST = 3.0
-"""So many times as long as looking took is rested at least: of 10,000 frames it takes 10 ms, with new ones 0.1 s."""
+"""So many times as long as looking took is rested at least: of 10,000 frames it takes 0.1 s."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
     failing: dict[int, _Failing] = {}
     coming: list[int] = []  # those in the folder that are not taken
     known, fault = False, ""  # whether `coming` is as the folder is now, and why it cannot be opened
-    looks = _Looks(path, patience.settle_s)
     came_s = changed_s = time.monotonic()
+    before = 0
     while not stop():
         now, ended = time.monotonic(), (path / END).exists()  # what came before it, the look finds
-        if looks.changed(now):
-            changed_s, known = now, False
+        if (state := _state(path)) != before:
+            before, changed_s, known = state, now, False
         idle = now - max(came_s, changed_s) >= patience.idle_s
         settled = ended or now - changed_s >= patience.settle_s
         opened = None
@@ -110,14 +110,14 @@ def arriving(path: Path, overrides: Overrides, patience: WatchLimits, stop: Call
         rest_s = max(POLL_S, REST * (time.monotonic() - now))
         for index in () if opened is None else coming if settled else coming[:-1]:
             assert opened is not None
-            before = failing.get(index, _Failing(now, now))
+            failed = failing.get(index, _Failing(now, now))
             frame = None
-            if ended or idle or now >= before.again_s:
+            if ended or idle or now >= failed.again_s:
                 try:
                     frame = opened.frame(index)
                 except InputError as error:
-                    failing[index] = _Failing(before.since_s, 2.0 * now - before.since_s, str(error))
-            if frame is None and not ended and now - before.since_s < patience.settle_s:
+                    failing[index] = _Failing(failed.since_s, 2.0 * now - failed.since_s, str(error))
+            if frame is None and not ended and now - failed.since_s < patience.settle_s:
                 break  # it may be being written
             if frame is None:
                 continue
@@ -167,52 +167,13 @@ class _Failing(NamedTuple):
     """Why; not the error itself, which holds the images that were read before it."""
 
 
-class _Looks:
-    """Looks at a folder and at the folders in it, which cost no more than the names of files that are complete."""
-
-    def __init__(self, path: Path, settle_s: float) -> None:
-        self._path = path
-        self._settle_s = settle_s  # a file in one of its folders is complete once it has not changed for so long
-        self._complete: dict[str, set[str]] = {}  # names by folder
-        self._newer: dict[str, tuple[object, float]] = {}  # state, and since when it has it, by path
-
-    def changed(self, now_s: float) -> bool:
-        """Return whether a file was made, has grown or is gone since the look before."""
-        changed, before, waiting = False, self._newer, [(str(self._path), True)]
-        self._newer = {}
-        while waiting:
-            folder, is_top = waiting.pop()
-            complete, there, others = self._complete.setdefault(folder, set()), 0, list[os.DirEntry[str]]()
-            with suppress(OSError), os.scandir(folder) as entries:  # it may go away between two looks
-                for entry in entries:
-                    if entry.name in complete:
-                        there += 1
-                    else:
-                        others.append(entry)
-            if there < len(complete):
-                names: set[str] = set()
-                with suppress(OSError):
-                    names.update(os.listdir(folder))
-                complete &= names
-                changed = True
-            for entry in others:
-                state, is_folder = _state(entry), entry.is_dir()
-                known, since_s = before.pop(entry.path, (None, now_s))
-                if state != known:
-                    since_s, changed = now_s, True
-                if is_folder or is_top or now_s - since_s < self._settle_s:
-                    self._newer[entry.path] = state, since_s
-                else:
-                    complete.add(entry.name)
-                if is_folder and is_top:
-                    waiting.append((entry.path, False))
-        return changed or bool(before)
-
-
-def _state(entry: os.DirEntry[str]) -> tuple[int, int]:
-    """Return what changes when a file, or what a folder holds, does."""
-    try:
-        status = entry.stat()
-    except OSError:  # it went away, or is a link to nothing
-        return 0, 0
-    return status.st_mtime_ns, status.st_size
+def _state(folder: str | Path, *, deep: bool = True) -> int:
+    """Return a number that is another once a file in a folder, or in a folder in it, is made, changes or goes."""
+    state = 0
+    with suppress(OSError), os.scandir(folder) as entries:  # it may go away meanwhile
+        for entry in entries:
+            with suppress(OSError):  # so may a file, or it is a link to nothing
+                status = entry.stat()
+                state += hash((entry.path, status.st_mtime_ns, status.st_size))
+                state += _state(entry.path, deep=False) if deep and entry.is_dir() else 0
+    return state

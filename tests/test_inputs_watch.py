@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import threading
@@ -20,7 +19,7 @@ from PIL import Image
 
 from modeler.sequences import AbstractSequence, BopSequence, Overrides, WatchLimits, open_sequence, watch, write_bop
 from modeler.sequences.base import AbstractDerived
-from modeler.sequences.watch import POLL_S, _Looks, _state, arriving
+from modeler.sequences.watch import POLL_S, _state, arriving
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import small_frames, write_bundlesdf, write_tum
 
@@ -218,49 +217,25 @@ def test_frames_that_come_late_are_not_lost(tmp_path: Path, frames: list[Frame])
     assert taken == [0, 1, 3, 4, 2]
 
 
-def test_a_link_to_nothing_does_not_make_frames_count_as_settled(tmp_path: Path, frames: list[Frame]) -> None:
-    """As editors lock files."""
-    write_bop(tmp_path / "s", frames)
-    for folder in (tmp_path / "s", tmp_path / "s" / "rgb"):
-        (folder / ".#lock").symlink_to("nobody@nowhere.1")
-    looks = _Looks(tmp_path / "s", settle_s=1.0)
-    assert [looks.changed(0.0), looks.changed(0.1)] == [True, False]
-    for name in ("rgb/000004.png", "scene_camera.json"):
-        (tmp_path / "s" / name).touch()
-        assert [looks.changed(0.2), looks.changed(0.3)] == [True, False]
-
-
-def test_a_look_costs_time_for_what_is_new_alone(
-    tmp_path: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looked: list[str] = []
-
-    def counted(entry: os.DirEntry[str]) -> tuple[int, int]:
-        looked.append(entry.name)
-        return _state(entry)
-
-    monkeypatch.setattr(WATCHING, "_state", counted)
-    write_bop(tmp_path / "s", frames)
-    looks = _Looks(tmp_path / "s", settle_s=1.0)
-    always = sorted(entry.name for entry in (tmp_path / "s").iterdir())
-    assert looks.changed(0.0)
-    assert len(looked) == len(always) + 3 * len(frames)
-    assert not looks.changed(2.0)  # all are complete
-    new = tmp_path / "s" / "depth" / "000009.png"
-    for now_s, act, expected in (
-        (2.1, new.touch, [new.name]),
-        (2.2, lambda: new.write_bytes(b"more"), [new.name]),
-        (2.3, lambda: new.rename(new.with_name("000010.png")), ["000010.png"]),
-        (2.4, (tmp_path / "s" / "rgb" / "000000.png").unlink, ["000010.png"]),
-        (2.5, (tmp_path / "s" / "scene_camera.json").touch, ["000010.png"]),
+def test_the_state_of_a_folder_is_another_once_a_file_in_it_is(tmp_path: Path, frames: list[Frame]) -> None:
+    folder = tmp_path / "s"
+    write_bop(folder, frames)
+    for place in (folder, folder / "rgb"):
+        (place / ".#lock").symlink_to("nobody@nowhere.1")  # as editors lock files
+    new = folder / "depth" / "000009.png"
+    states = [_state(folder)]
+    for act in (
+        new.touch,
+        lambda: new.write_bytes(b"more"),
+        lambda: new.rename(new.with_name("000010.png")),
+        (folder / "rgb" / "000000.png").unlink,
+        (folder / "scene_camera.json").touch,
+        lambda: shutil.rmtree(folder),
     ):
-        looked.clear()
         act()
-        assert looks.changed(now_s)
-        assert sorted(looked) == sorted([*always, *expected])
-    assert not looks.changed(9.0)
-    shutil.rmtree(tmp_path / "s")
-    assert [looks.changed(10.0), looks.changed(11.0)] == [True, False]
+        states.append(_state(folder))
+        assert _state(folder) == states[-1]
+    assert len({*states}) == len(states)
 
 
 def test_a_damaged_frame_is_tried_less_and_less_often(
