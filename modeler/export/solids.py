@@ -146,6 +146,10 @@ FRICTION: Final = (0.8, 0.005, 0.0001)
 MOST_TRIANGLES: Final = 200_000  # MuJoCo refuses meshes with more
 
 
+MUJOCO_SCENE: Final = "scene.xml"  # file of the model on a plane
+GAZEBO: Final = ("model.sdf", "model.config")  # files of the model, and of what Gazebo's list of models says of it
+
+
 @dataclass(frozen=True)
 class PhysicsFiles:
     """Where the parts of a model for simulators lie in its folder."""
@@ -170,35 +174,9 @@ class PhysicsFiles:
         """The image around it."""
         return self.folder / "visual.png"
 
-    @property
-    def mjcf(self) -> Path:
-        """The model for MuJoCo."""
-        return self.folder / f"{self.name}.xml"
-
-    @property
-    def scene(self) -> Path:
-        """The model on a plane, for MuJoCo."""
-        return self.folder / "scene.xml"
-
-    @property
-    def urdf(self) -> Path:
-        """The model as URDF."""
-        return self.folder / f"{self.name}.urdf"
-
-    @property
-    def usd(self) -> Path:
-        """The model as OpenUSD."""
-        return self.folder / f"{self.name}.usd"
-
-    @property
-    def sdf(self) -> Path:
-        """The model for Gazebo."""
-        return self.folder / "model.sdf"
-
-    @property
-    def config(self) -> Path:
-        """What Gazebo's list of models says of it."""
-        return self.folder / "model.config"
+    def model(self, suffix: str) -> Path:
+        """Return the model in the format of a suffix: `.xml` (MuJoCo), `.urdf` or `.usd`."""
+        return self.folder / f"{self.name}{suffix}"
 
     def part(self, number: int) -> Path:
         """Return a convex part."""
@@ -228,7 +206,7 @@ def write_mjcf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
     )
     look = f'material="{name}"' if files.coloured else 'rgba="0.7 0.7 0.7 1"'
     write_atomically(
-        files.mjcf,
+        files.model(".xml"),
         f'<mujoco model="{name}">\n'
         "  <asset>\n"
         f"{texture if files.coloured else ''}"
@@ -247,9 +225,9 @@ def write_mjcf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
         "</mujoco>\n",
     )
     write_atomically(
-        files.scene,
+        files.folder / MUJOCO_SCENE,
         f'<mujoco model="{name} on a plane">\n'
-        f'  <include file="{files.mjcf.name}"/>\n'
+        f'  <include file="{files.model(".xml").name}"/>\n'
         "  <worldbody>\n"
         '    <light pos="0 0 1.5" dir="0 0 -1" directional="true"/>\n'
         '    <geom name="ground" type="plane" size="0 0 0.05" rgba="0.4 0.45 0.5 1"/>\n'
@@ -266,7 +244,7 @@ def write_urdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
         for k in range(len(parts.meshes))
     )
     write_atomically(
-        files.urdf,
+        files.model(".urdf"),
         '<?xml version="1.0"?>\n'
         f'<robot name="{files.name}">\n'
         f'  <link name="{files.name}">\n'
@@ -296,7 +274,7 @@ def write_sdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
         for k in range(len(parts.meshes))
     )
     write_atomically(
-        files.sdf,
+        files.folder / GAZEBO[0],
         '<?xml version="1.0"?>\n'
         '<sdf version="1.7">\n'
         f'  <model name="{name}">\n'
@@ -314,12 +292,12 @@ def write_sdf(files: PhysicsFiles, body: Body, parts: ConvexParts) -> None:
         "</sdf>\n",
     )
     write_atomically(
-        files.config,
+        files.folder / GAZEBO[1],
         '<?xml version="1.0"?>\n'
         "<model>\n"
         f"  <name>{name}</name>\n"
         "  <version>1.0</version>\n"
-        f'  <sdf version="1.7">{files.sdf.name}</sdf>\n'
+        f'  <sdf version="1.7">{GAZEBO[0]}</sdf>\n'
         "</model>\n",
     )
 

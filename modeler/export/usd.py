@@ -77,9 +77,10 @@ def write_usd(files: PhysicsFiles, model: ObjectModel, texture: Texture | None, 
         UsdPhysics.MeshCollisionAPI.Apply(part.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
         UsdShade.MaterialBindingAPI.Apply(part.GetPrim()).Bind(rough, UsdShade.Tokens.weakerThanDescendants, "physics")
     with tempfile.TemporaryDirectory() as folder:
-        written = Path(folder) / files.usd.name
+        usd = files.model(".usd")
+        written = Path(folder) / usd.name
         stage.Export(str(written), addSourceFileComment=False)
-        write_atomically(files.usd, written.read_bytes())
+        write_atomically(usd, written.read_bytes())
 
 
 def _mesh(stage: Any, path: Any, vertices_m: Array, triangles: npt.NDArray[np.int64]) -> Any:

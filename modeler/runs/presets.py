@@ -167,8 +167,12 @@ class Preset:
             return (*(self.out / "sparse" / "0" / f"{name}.bin" for name in ("cameras", "images", "points3D")),)
         of = solids.PhysicsFiles(self.out, coloured=True)
         if self.purpose == "isaac":
-            return (of.usd, of.texture, files.pose_file(of.usd))
-        of_programs = {"mujoco": (of.mjcf, of.scene), "urdf": (of.urdf,), "gazebo": (of.sdf, of.config)}
+            return (of.model(".usd"), of.texture, files.pose_file(of.model(".usd")))
+        of_programs = {
+            "mujoco": (of.model(".xml"), self.out / solids.MUJOCO_SCENE),
+            "urdf": (of.model(".urdf"),),
+            "gazebo": tuple(self.out / name for name in solids.GAZEBO),
+        }
         model = of_programs[self.purpose]
         return (*model, *files.files_of(of.visual, textured=True), files.pose_file(of.visual), of.part(0))
 
@@ -256,7 +260,7 @@ class Preset:
         solids.write_mjcf(solid.of, solid.body, solid.parts)
 
         def settles() -> tuple[bool, str]:
-            settled = solids.settled_in_mujoco(solid.of.scene)
+            settled = solids.settled_in_mujoco(self.out / solids.MUJOCO_SCENE)
             return settled.at_rest, settled.words
 
         return solid.file_checks().attempt(settles, "MuJoCo is not installed, so not loaded there")
@@ -267,7 +271,7 @@ class Preset:
 
         def settles() -> tuple[bool, str]:
             with _quiet():  # PyBullet writes to stdout by itself
-                settled = solids.settled_in_pybullet(solid.of.urdf, solids.drop_height_m(solid.parts))
+                settled = solids.settled_in_pybullet(solid.of.model(".urdf"), solids.drop_height_m(solid.parts))
             return settled.at_rest, settled.words
 
         return solid.file_checks().attempt(settles, "PyBullet is not installed, so not loaded there")
@@ -283,8 +287,8 @@ class Preset:
         write_usd(of, solid.model, solid.texture, solid.body, solid.parts)
         if solid.texture is not None:
             files.write_atomically(of.texture, encoded(solid.texture.image, "PNG"))
-        solid.place.write(of.usd)
-        return Checks().also(*opened_usd(of.usd)).and_also(solid.checks())
+        solid.place.write(of.model(".usd"))
+        return Checks().also(*opened_usd(of.model(".usd"))).and_also(solid.checks())
 
     def _solid_files(self) -> _Solid:
         """Write the visual mesh and the convex parts of the solid, and return it."""
