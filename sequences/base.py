@@ -332,11 +332,7 @@ def _size_bytes(frame: Frame) -> int:
 
 
 def check_every(every: int) -> None:
-    """Check a stride.
-
-    Raises:
-        InputError: if it is less than 1.
-    """
+    """Check a stride."""
     if every < 1:
         raise InputError(f"`every` {every} keeps no frame; give a whole number of at least 1.")
 

@@ -119,11 +119,7 @@ class Survey:
         return tuple(found)
 
     def check(self, name: str, *, despite_doubts: bool = False) -> None:
-        """Refuse a sequence with a plain error, unless asked not to.
-
-        Raises:
-            InputError: if it has one.
-        """
+        """Refuse a sequence with a plain error, unless asked not to."""
         if self.plain_errors and not despite_doubts:
             raise InputError(f"{name}: {self.plain_errors[0]} (or `despite_doubts`)")
 

@@ -48,11 +48,7 @@ def usual_workers() -> int:
 
 
 def check_engine(name: str) -> None:
-    """Reject unknown names of engines.
-
-    Raises:
-        InputError: if it is none.
-    """
+    """Reject unknown names of engines."""
     kind, _, what = name.partition(":")
     if name != "processes" and not what:
         raise InputError(

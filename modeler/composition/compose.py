@@ -85,11 +85,7 @@ def modeler(
 
 
 def check_region(where: ObjectOptions, sequence: AbstractSequence) -> None:
-    """Refuse a region that is not part of the image.
-
-    Raises:
-        InputError: if some of it lies outside the first frame.
-    """
+    """Refuse a region that is not part of the image."""
     if where.roi is None:
         return
     camera = sequence.frame(sequence.indices[0]).camera

@@ -78,11 +78,7 @@ class RunFolder:
         return cls(path, len(folder.report()["frames"]) if resumes else 0)
 
     def check(self, *, overwrite: bool = False, resume: bool = False) -> None:
-        """Refuse to make a run where other things are, or, unless asked for, where another run is.
-
-        Raises:
-            InputError: if that is so.
-        """
+        """Refuse to make a run where other things are, or, unless asked for, where another run is."""
         if self.is_empty:
             return
         if not self.is_run:

@@ -10,11 +10,7 @@ from modeler.types import InputError
 
 
 def check_folder(out: Path, inputs: Iterable[Path]) -> None:
-    """Reject a folder that is, or is inside, an input of the command.
-
-    Raises:
-        InputError: if writing there would change an input.
-    """
+    """Reject a folder that is, or is inside, an input of the command."""
     found = {name: path for path in inputs for name in _identities(path)}
     place = Path(os.path.realpath(out))
     for part in (place, *place.parents):
@@ -26,11 +22,7 @@ def check_folder(out: Path, inputs: Iterable[Path]) -> None:
 
 
 def check_files(outs: Sequence[Path], inputs: Sequence[Path], *, overwrite: bool) -> None:
-    """Reject files that would change an input, and existing files unless `overwrite` is set.
-
-    Raises:
-        InputError: if a file may not be written.
-    """
+    """Reject files that would change an input, and existing files unless `overwrite` is set."""
     for out in outs:
         check_folder(out, inputs)
         if not os.path.lexists(out):
@@ -52,9 +44,6 @@ def check_run_folder(out: Path, inputs: Iterable[Path], *, overwrite: bool, resu
         inputs: files and folders that it reads.
         overwrite: whether a run may be replaced.
         resume: whether it may be continued; None if the command cannot.
-
-    Raises:
-        InputError: if no run may be made there.
     """
     from modeler.export import RunFolder
 

@@ -33,11 +33,7 @@ class TrackFolder:
     """When it may be written again."""
 
     def check(self, *, overwrite: bool) -> None:
-        """Refuse a folder with other contents or, unless asked for, with another track.
-
-        Raises:
-            InputError: if it is such a one.
-        """
+        """Refuse a folder with other contents or, unless asked for, with another track."""
         if not self.path.exists():
             return
         if not self.path.is_dir():

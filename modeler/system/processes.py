@@ -44,11 +44,7 @@ def install_command(extra: str) -> str:
 
 
 def check_installed(module: str, package: str, extra: str) -> None:
-    """Reject work that needs a package that is not installed.
-
-    Raises:
-        InputError: if it is not installed.
-    """
+    """Reject work that needs a package that is not installed."""
     from modeler.types import InputError  # not with the command line's help
 
     if importlib.util.find_spec(module) is None:

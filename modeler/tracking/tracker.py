@@ -383,11 +383,7 @@ class Tracker:
         return odds, found
 
     def _check_size(self, view: RayImage) -> None:
-        """Reject a model whose lengths cannot be m, as it is far larger or smaller than what the frame shows.
-
-        Raises:
-            InputError: if it is.
-        """
+        """Reject a model whose lengths cannot be m, as it is far larger or smaller than what the frame shows."""
         ratio = self.renderer.radius_m / (2.0 * view.size_m)
         if 1.0 / _UNIT < ratio < _UNIT:
             return

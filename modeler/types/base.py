@@ -85,9 +85,6 @@ def checked(what: _Called) -> _Called:
     """Refuse arguments of other types than a function, or a dataclass for its fields, states; a decorator.
 
     Elements of sequences are checked, too; of what becomes an array, only that it is not None.
-
-    Raises:
-        InputError: when it is called with one; the error names it.
     """
     function: Any = what.__init__ if inspect.isclass(what) else what
     annotations = {name: str(one.annotation) for name, one in inspect.signature(function).parameters.items()}
@@ -191,11 +188,7 @@ def check_parameters(component: Any) -> None:
 
 
 def check_covariance(name: str, covariance: Array) -> None:
-    """Check that a covariance (n, n) is finite, symmetric and positive definite.
-
-    Raises:
-        InputError: if it is not.
-    """
+    """Check that a covariance (n, n) is finite, symmetric and positive definite."""
     valid = np.isfinite(covariance).all() and np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0)
     if not valid or np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise InputError(f"{name} is not a covariance; give a finite, symmetric, positive definite matrix")
