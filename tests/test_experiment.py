@@ -235,7 +235,7 @@ def test_summaries_of_failures_alone_have_no_quantiles() -> None:
     failed = Trial("box", "icp", 1, 1, 0, "too few points", usable=False, rotation_deg=25.0)
     (row,) = summaries([failed], success_deg=16.2)
     assert row.successes == 0
-    assert all(math.isnan(value) for value in (*row.rotation_error_deg, row.nees, row.inside_95, row.seconds))
+    assert all(math.isnan(value) for value in (*astuple(row.rotation_error_deg), row.nees, row.inside_95, row.seconds))
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -117,10 +117,10 @@ def written(folder: Path) -> tuple[solids.PhysicsFiles, solids.Body]:
 
 def test_simulators_files_hold_mass_and_inertia_in_their_own_order(tmp_path: Path) -> None:
     of, body = written(tmp_path)
-    inertial = ElementTree.parse(of.mjcf).find(".//inertial")
+    inertial = ElementTree.parse(of.model(".xml")).find(".//inertial")
     xx, yy, zz, xy, xz, yz = map(float, inertial.attrib["fullinertia"].split())
     np.testing.assert_allclose([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], body.inertia_kg_m2, rtol=1e-7)
-    tree = ElementTree.parse(of.urdf)
+    tree = ElementTree.parse(of.model(".urdf"))
     tags = {name: tree.find(f".//inertial/{name}") for name in ("inertia", "origin", "mass")}
     found = {name: tag.attrib for name, tag in tags.items() if tag is not None}
     for row, column in itertools.combinations_with_replacement(range(3), 2):
@@ -128,28 +128,28 @@ def test_simulators_files_hold_mass_and_inertia_in_their_own_order(tmp_path: Pat
         assert stated == pytest.approx(body.inertia_kg_m2[row, column], rel=1e-6)
     assert float(found["mass"]["value"]) == pytest.approx(2.0)
     np.testing.assert_allclose(list(map(float, found["origin"]["xyz"].split())), body.centre_m, rtol=1e-6)
-    assert of.mjcf.name == "a_box.xml"
+    assert of.model(".xml").name == "a_box.xml"
 
 
 def test_mujoco_takes_the_body_as_it_is(tmp_path: Path) -> None:
     mujoco = pytest.importorskip("mujoco")
     of, body = written(tmp_path)
-    model = mujoco.MjModel.from_xml_path(str(of.scene))
+    model = mujoco.MjModel.from_xml_path(str(of.folder / solids.MUJOCO_SCENE))
     assert model.body_mass[1] == pytest.approx(2.0)
     np.testing.assert_allclose(np.sort(model.body_inertia[1]), np.linalg.eigvalsh(body.inertia_kg_m2), rtol=1e-6)
-    assert solids.settled_in_mujoco(of.scene).at_rest
+    assert solids.settled_in_mujoco(of.folder / solids.MUJOCO_SCENE).at_rest
 
 
 def test_pybullet_takes_the_body_as_it_is(tmp_path: Path) -> None:
     pybullet = pytest.importorskip("pybullet")
     of, _ = written(tmp_path)
     client = pybullet.connect(pybullet.DIRECT)
-    number = pybullet.loadURDF(str(of.urdf), flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
+    number = pybullet.loadURDF(str(of.model(".urdf")), flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
     dynamics = pybullet.getDynamicsInfo(number, -1)
     pybullet.disconnect(client)
     assert dynamics[0] == pytest.approx(2.0)
     assert dynamics[1] == pytest.approx(solids.FRICTION[0])
-    assert solids.settled_in_pybullet(of.urdf, 0.2).at_rest
+    assert solids.settled_in_pybullet(of.model(".urdf"), 0.2).at_rest
 
 
 def test_drake_takes_the_body_of_gazebo_as_it_is(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_drake_takes_the_body_of_gazebo_as_it_is(tmp_path: Path) -> None:
 
     of, body = written(tmp_path)
     builder = RobotDiagramBuilder()
-    Parser(builder.plant(), builder.scene_graph()).AddModels(str(of.sdf))
+    Parser(builder.plant(), builder.scene_graph()).AddModels(str(of.folder / "model.sdf"))
     builder.plant().Finalize()
     link = builder.plant().GetBodyByName("link")
     assert link.default_mass() == pytest.approx(2.0)
@@ -171,7 +171,7 @@ def test_drake_takes_the_body_of_gazebo_as_it_is(tmp_path: Path) -> None:
     inspector = builder.scene_graph().model_inspector()
     shapes = [inspector.GetShape(number) for number in inspector.GetAllGeometryIds()]
     assert [Path(shape.source().path()) for shape in shapes] == [of.visual, of.part(0)]
-    assert ElementTree.parse(of.config).findtext("sdf") == of.sdf.name
+    assert ElementTree.parse(of.folder / "model.config").findtext("sdf") == "model.sdf"
 
 
 @pytest.mark.parametrize("coloured", [True, False])
@@ -193,7 +193,7 @@ def test_usd_holds_a_rigid_body_in_metres(tmp_path: Path, coloured: bool) -> Non
         of.texture.write_bytes(encoded(texture.image, "PNG"))
     write_usd(of, model, texture, body, parts)
 
-    stage = Usd.Stage.Open(str(of.usd))
+    stage = Usd.Stage.Open(str(of.model(".usd")))
     assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (1.0, "Z")
     root = stage.GetDefaultPrim()
     mass = UsdPhysics.MassAPI(root)

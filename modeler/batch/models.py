@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from modeler.batch.jobs import NOTES, read_note
 from modeler.export import RunFolder, mesh_of, poses_of, read_model
 from modeler.export.files import write_atomically
 from modeler.export.placing import model_upright
+from modeler.export.report import json_value
 from modeler.system.regular_files import read_regular
 from modeler.types import ACCEPTED, Array, InputError, ObjectModel
 
@@ -44,17 +44,15 @@ def record_of(run: Path) -> dict[str, Any]:
         model = read_model(mesh_of(run))
         record |= model_columns(model, report)
         record |= _errors(run, report, model.vertices_m.mean(axis=0))
-    return finite(record)
+    return json_value(record)
 
 
 def _errors(run: Path, report: dict[str, Any], centre_m: Array) -> dict[str, float]:
     """Return the pose errors of an object with that centre; empty without ground truth."""
     from modeler.evaluation import trajectory_errors
-    from modeler.runs.reopening import parts_of
+    from modeler.runs.reopening import parts_of, truth_of
 
-    truth: dict[int, Any] = {}
-    for part in parts_of(run):
-        truth |= part.truth() or {}
+    truth = truth_of(parts_of(run))
     poses = {frame: pose.mean for frame, pose in poses_of(report).items() if frame in truth}
     if not poses:
         return {}
@@ -268,10 +266,3 @@ def enclosed_m3(vertices_m: Array, triangles: npt.NDArray[np.int64]) -> float:
     fan = np.cross(centred_m[rim[:, 1]], centred_m[rim[:, 0]])
     volume += float(np.einsum("ij,ij->", middle[loop[place[:, 0]]], fan))
     return volume / 6.0
-
-
-def finite(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values with None for numbers that are not finite, as JSON and tables have it."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
-    }

@@ -204,14 +204,13 @@ def _check(options: Build) -> None:
 
 def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence, Mapping[int, str]]:
     """Return the sequence, the selected frames and their digests; what is unreadable is found before all else."""
-    from modeler.cli.reading import watched
+    from modeler.cli.reading import opened
     from modeler.runs.reopening import calibrated
-    from modeler.sequences import KeptSequence, frame_range, open_sequence, survey
+    from modeler.sequences import frame_range, survey
     from modeler.types import InputError
 
-    path, overrides = options.sequence, options.given.overrides()
-    whole = watched(path, overrides, options.idle_s) if options.watch else open_sequence(path, overrides)
-    whole = whole if whole.live else KeptSequence(whole)
+    path = options.sequence
+    whole = opened(path, options.given, options.idle_s if options.watch else None)
     whole = calibrated(whole, options.model.sensor, options.model.camera)
     frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
     digests: Mapping[int, str] = {}

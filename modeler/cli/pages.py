@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from modeler.cli.console import bar, say
 from modeler.cli.options import MovedOptions
 from modeler.composition.options import default
-
-if TYPE_CHECKING:
-    from modeler.types import Array
 
 
 @dataclass(frozen=True)
@@ -57,6 +53,7 @@ class Report:
         from modeler.export import RunFolder
         from modeler.export.run_folder import PAGE
         from modeler.runs.outputs import check_files, run_inputs
+        from modeler.runs.reopening import parts_of, truth_of
         from modeler.types import InputError
         from modeler.viz.report import write_page
 
@@ -64,9 +61,12 @@ class Report:
         inputs = run_inputs([self.run_folder], self.moved.sequence)
         check_files([out], inputs[1:] if self.out is None else inputs, overwrite=self.overwrite)
         RunFolder(self.run_folder).result()  # refuses folders without a finished run
-        truth, omitted = None, ""
+        truth, omitted = {}, ""
         try:
-            truth = _truth(self.run_folder, self.moved.sequence)
+            parts = [part for part in parts_of(self.run_folder, self.moved.sequence) if part.truth()]
+            for part in parts:
+                part.check()
+            truth = truth_of(parts)
         except InputError as error:
             if self.moved.sequence:
                 raise
@@ -76,19 +76,6 @@ class Report:
             say(omitted)
         say(f"open {out} in a browser")
         return 0
-
-
-def _truth(run: Path, sequences: tuple[Path, ...]) -> Mapping[int, Array] | None:
-    """Return the true camera_from_model by frame number; None if unknown."""
-    from modeler.runs.reopening import parts_of
-
-    poses: dict[int, Array] = {}
-    for part in parts_of(run, sequences):
-        truth = part.truth()
-        if truth is not None:
-            part.check()
-            poses |= truth
-    return poses or None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modeler.cli.console import bar, say
-from modeler.sequences import AbstractSequence, Overrides, WatchLimits, watch
+from modeler.cli.options import InputOptions
+from modeler.sequences import AbstractSequence, KeptSequence, WatchLimits, open_sequence, watch
 from modeler.sequences.base import AbstractDerived
 from modeler.types import Frame, InputError
 
@@ -52,15 +53,18 @@ def reading() -> Iterator[Callable[..., AbstractSequence]]:
         yield watched
 
 
-def watched(path: Path, overrides: Overrides, idle_s: float) -> AbstractSequence:
-    """Return the sequence that another program is writing at a path, once it has begun.
+def opened(path: Path, given: InputOptions, idle_s: float | None) -> AbstractSequence:
+    """Return a sequence, its first frames kept in memory; one that another program is writing, once it has begun.
 
     Args:
-        path: where it writes.
-        overrides: values that take precedence over its files.
-        idle_s: the sequence is over after this many seconds without a new frame.
+        path: of the sequence.
+        given: values that take precedence over its files.
+        idle_s: while it is written, it is over after this many seconds without a new frame; None: it is not.
     """
+    if idle_s is None:
+        whole = open_sequence(path, given.overrides())
+        return whole if whole.live else KeptSequence(whole)
     if not 0.0 < idle_s < math.inf:
         raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
     say(f"waiting for frames in {path}")
-    return watch(path, overrides, WatchLimits(idle_s))
+    return watch(path, given.overrides(), WatchLimits(idle_s))

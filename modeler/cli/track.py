@@ -85,15 +85,11 @@ class Track:
 
     def _opened(self, thing: KnownObject) -> tuple[AbstractSequence, AbstractSequence]:
         """Return the sequence, and the selected frames; those that are plainly not what they seem are refused."""
-        from modeler.cli.reading import watched
+        from modeler.cli.reading import opened
         from modeler.runs.reopening import calibrated
-        from modeler.sequences import KeptSequence, frame_range, open_sequence, survey
+        from modeler.sequences import frame_range, survey
 
-        overrides = self.given.overrides()
-        whole = (
-            watched(self.sequence, overrides, self.idle_s) if self.watch else open_sequence(self.sequence, overrides)
-        )
-        whole = whole if whole.live else KeptSequence(whole)
+        whole = opened(self.sequence, self.given, self.idle_s if self.watch else None)
         whole = calibrated(whole, self.sensor, self.camera)
         whole = whole if self.camera is not None else thing.seen_by(whole)
         frames = whole.select(every=self.selection.every, frames=frame_range(self.selection.frames))

@@ -296,7 +296,8 @@ class Trial:
         )
 
 
-class Quantiles(NamedTuple):
+@dataclass(frozen=True)
+class Quantiles:
     """How errors are spread; NaN where there is none."""
 
     lower_quartile: float

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -16,8 +15,9 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.evaluation import SurfaceErrors, TrueSurface, align_to_model, rotation_error_deg, surface_errors
-from modeler.experiment.experiment import Experiment, Quantiles, Recorded, Summary, Trial, summaries
+from modeler.experiment.experiment import Experiment, Recorded, Summary, Trial, summaries
 from modeler.export import write_atomically
+from modeler.export.report import json_value
 from modeler.fusion import Fuser
 from modeler.types import Array, InputError, ObjectModel, RayImage
 
@@ -213,16 +213,16 @@ def results_json(experiment: Experiment, trials: Sequence[Trial], rows: Sequence
         "pairing": asdict(experiment.pairing),
         "points": experiment.points,
         "success_deg": experiment.success_deg,
-        "summaries": [_finite(asdict(row)) for row in rows],
-        "trials": [_finite(asdict(trial)) for trial in trials],
+        "summaries": [asdict(row) for row in rows],
+        "trials": [asdict(trial) for trial in trials],
     }
-    return json.dumps(results, indent=1, allow_nan=False) + "\n"
+    return json.dumps(json_value(results), indent=1, allow_nan=False) + "\n"
 
 
 def results_csv(trials: Sequence[Trial]) -> str:
     """Return the trials as CSV, a field a column but for the estimate; numbers that are not finite are empty."""
     names = [f.name for f in fields(Trial) if f.name != "target_from_source"]
-    return _csv(names, (_finite(asdict(trial)) for trial in trials))
+    return _csv(names, (json_value(asdict(trial)) for trial in trials))
 
 
 def _csv(names: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
@@ -232,16 +232,3 @@ def _csv(names: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
-
-
-def _finite(record: Mapping[str, object]) -> dict[str, object]:
-    """Return a record whose numbers JSON can hold: None for what is not finite."""
-
-    def plain(value: object) -> object:
-        if isinstance(value, Quantiles):
-            return _finite(value._asdict())
-        if isinstance(value, tuple):
-            return [plain(entry) for entry in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return {name: plain(value) for name, value in record.items()}

@@ -116,7 +116,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         for frame, pose in sorted(solution.trajectory.items())
     ]
     edges = [edge_record(edge, solution, views.get(edge.source)) for edge in step.edges_so_far]
-    report = {**_json(report), "edges": edges, "poses": _json(poses)}
+    report = {**json_value(report), "edges": edges, "poses": json_value(poses)}
     return {**report, "remedies": list(meta.advice(report)) if step.last and not verdict.trustworthy else []}
 
 
@@ -200,7 +200,7 @@ def edge_record(
         "overlap": posterior.overlap,
         "seconds": posterior.seconds,
     }
-    return _json(record)
+    return json_value(record)
 
 
 def _pose_record(pose: PoseGaussian, sigma_focal: float) -> dict[str, Any]:
@@ -213,17 +213,17 @@ def _pose_record(pose: PoseGaussian, sigma_focal: float) -> dict[str, Any]:
     }
 
 
-def _json(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Return a JSON value: matrices row by row, None for numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {key: _json(entry) for key, entry in value.items()}
+        return {key: json_value(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
         plain = value.ravel().tolist()
-        return plain if np.isfinite(value).all() else _json(plain)
+        return plain if np.isfinite(value).all() else json_value(plain)
     if isinstance(value, list | tuple):
-        return [_json(entry) for entry in value]
+        return [json_value(entry) for entry in value]
     if isinstance(value, np.generic):
-        return _json(value.item())
+        return json_value(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -161,6 +161,11 @@ def parts_of(run: Path, moved: Sequence[Path] = ()) -> tuple[Part, ...]:
     return found
 
 
+def truth_of(parts: Sequence[Part]) -> dict[int, Array]:
+    """Return the true camera_from_model (4, 4) by frame number of the joined run, where it is known."""
+    return {frame: pose for part in parts for frame, pose in (part.truth() or {}).items()}
+
+
 def _parts(run: Path, places: deque[Path] | None, within: tuple[Path, ...]) -> tuple[Part, ...]:
     """Return the parts of a run; `within` are the joined runs that contain it, from the outermost."""
     if run.resolve() in within:
