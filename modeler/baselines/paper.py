@@ -284,6 +284,5 @@ def _side(own: Measured, other: Measured, limits: tuple[float, float]) -> Side:
     terms = 2.0 * np.sqrt(8.0) * size[0] * size[1]
     sigmas = np.sqrt(2.0 * np.log(max(terms / reject_below, 1.0))) + 1e-6
     margins_m = sigmas * np.sqrt(noise[2, 2] + spread_m2)
-    height, width = near_m.shape
-    image = np.array([fx, fy, cx + across, cy + down, width, height, widening])
+    image = np.array([fx, fy, cx + across, cy + down, *near_m.shape[::-1], widening])
     return np.column_stack([own.points_m, margins_m]), near_m, image
