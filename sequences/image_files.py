@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import os
 import re
 import tempfile
-import threading
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -21,6 +19,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from modeler.sequences.input_files import entries, input_errors
+from modeler.system.processes import diverted
 from modeler.system.regular_files import open_regular, unreadable
 from modeler.types import BoolArray, InputError
 
@@ -54,7 +53,7 @@ def open_image(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Im
             with Image.open(stream, formats=formats) as image:
                 if image.width * image.height > MAX_PIXELS:
                     raise Image.DecompressionBombError
-                with quiet() if image.format == "TIFF" else contextlib.nullcontext():
+                with diverted(2) if image.format == "TIFF" else contextlib.nullcontext():
                     image.load()
                 return image
     except InputError:
@@ -90,23 +89,6 @@ def _unlogged() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
-
-
-@contextlib.contextmanager
-def quiet(into: IO[bytes] | None = None) -> Iterator[None]:
-    """Keep a library from writing to stderr, which is one for all threads: into a file, or nowhere."""
-    with _STDERR:
-        stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-        try:
-            os.dup2(nowhere if into is None else into.fileno(), 2)
-            yield
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-            os.close(nowhere)
-
-
-_STDERR = threading.Lock()
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -336,7 +318,7 @@ def _read_exr(file: BinaryIO) -> npt.NDArray[np.generic]:
 
     name = f"/dev/fd/{file.fileno()}"  # the library takes no open files
     with tempfile.TemporaryFile() as said:  # where it reports pixels that it could not read, and goes on
-        with quiet(said), contextlib.redirect_stdout(io.StringIO()):  # where it warns of what it then raises
+        with diverted(2, said), contextlib.redirect_stdout(io.StringIO()):  # where it warns of what it then raises
             with OpenEXR.File(name, header_only=True) as header:
                 (left, top), (right, bottom) = (corner.tolist() for corner in header.header()["dataWindow"])
                 _check_pixels(right - left + 1, bottom - top + 1)

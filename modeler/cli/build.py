@@ -72,8 +72,8 @@ class Build:
         from modeler.composition import compose
         from modeler.export import PairCache, RunFolder, RunMeta, locked
         from modeler.runs.outputs import check_run_folder, run_inputs
-        from modeler.runs.reopening import estimated_camera
         from modeler.segmentation import scene_frames
+        from modeler.sequences import read_focal_factor
         from modeler.system.concurrency import in_parallel
         from modeler.viz.stream import load
 
@@ -94,7 +94,7 @@ class Build:
             seed=self.method.seed,
             prior=prior,
             settings=self.settings(),
-            camera=estimated_camera(self.model.camera),
+            camera=None if self.model.camera is None else read_focal_factor(self.model.camera).values(),
             digests=digests,
             advice=partial(self.advice, modeler.prior),
         )

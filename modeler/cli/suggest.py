@@ -49,7 +49,7 @@ class Suggest:
         from modeler.suggestion import suggest
         from modeler.types import InputError
 
-        goal, asked = self._goal()
+        goal = self._goal()
         given = None if self.candidates is None else read_candidates(self.candidates)
         run = reopened(self.run_folder, self.moved.sequence, say)
         part, *others = run.parts
@@ -68,14 +68,15 @@ class Suggest:
         if not trusted:
             reason = next(iter(run.report.get("reasons") or ()), "see its report.json")
             say(f"the run is not to be trusted, and so neither are these predictions: {reason}")
-        if not asked:
+        if goal is None:
             say(found.summary)
             return 0
-        say(_verdict(found.summary, reached=found.reached, trusted=trusted))
+        doubt = "" if trusted else ", but the run cannot be trusted (see its report.json)"
+        say(f"goal reached{doubt}: {found.summary}" if found.reached else f"goal not reached: {found.summary}")
         return 0 if found.reached and trusted else 3
 
-    def _goal(self) -> tuple[Goal, bool]:
-        """Return the goal, and whether the user gave it."""
+    def _goal(self) -> Goal | None:
+        """Return the goal that the user gave."""
         from modeler.suggestion import Goal
         from modeler.types import InputError
 
@@ -86,22 +87,10 @@ class Suggest:
             if value is not None and not (0.0 < value <= largest and math.isfinite(value)):
                 wanted = "a share above 0 and up to 1" if unit == "share" else f"a positive number of {unit}"
                 raise InputError(f"{names[unit]} {value:g} is out of range; give {wanted}")
-        asked = any(value is not None for value in limits.values())
-        if not asked:
-            return Goal(), False
-        return (
-            Goal(
-                pose_deg=math.inf if self.until_pose_deg is None else self.until_pose_deg,
-                seen=0.0 if self.until_seen is None else self.until_seen,
-                sigma_m=None if self.until_sigma_mm is None else 1e-3 * self.until_sigma_mm,
-            ),
-            True,
+        if all(value is None for value in limits.values()):
+            return None
+        return Goal(
+            pose_deg=math.inf if self.until_pose_deg is None else self.until_pose_deg,
+            seen=0.0 if self.until_seen is None else self.until_seen,
+            sigma_m=None if self.until_sigma_mm is None else 1e-3 * self.until_sigma_mm,
         )
-
-
-def _verdict(summary: str, *, reached: bool, trusted: bool) -> str:
-    if reached and trusted:
-        return f"goal reached: {summary}"
-    if reached:
-        return f"goal reached, but the run cannot be trusted (see its report.json): {summary}"
-    return f"goal not reached: {summary}"

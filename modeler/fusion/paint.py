@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from modeler.system.pictures import linear_light
 from modeler.types import Array, areas_m2
 
 
@@ -66,8 +67,6 @@ _LAB_FROM_ROOTS = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0
 
 def cielab(srgb: Array) -> Array:
     """Return colours (n, 3) in CIELAB of sRGB colours (n, 3) from 0 to 255, under its white (CIE 15)."""
-    share = np.asarray(srgb, dtype=np.float64) / 255.0
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    xyz = linear @ _XYZ_FROM_RGB.T / _XYZ_FROM_RGB.sum(axis=1)
+    xyz = linear_light(np.asarray(srgb, dtype=np.float64) / 255.0) @ _XYZ_FROM_RGB.T / _XYZ_FROM_RGB.sum(axis=1)
     roots = np.where(xyz > (6.0 / 29.0) ** 3, np.cbrt(xyz), xyz / (3.0 * (6.0 / 29.0) ** 2) + 4.0 / 29.0)
     return roots @ _LAB_FROM_ROOTS.T - np.array([16.0, 0.0, 0.0])

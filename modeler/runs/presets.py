@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import os
-import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +23,7 @@ from modeler.runs.outputs import check_files, check_folder, run_inputs
 from modeler.runs.reopening import Reopened, reopened
 from modeler.sequences import finest_unit_mm, write_bop
 from modeler.system.pictures import encoded
-from modeler.system.processes import check_installed
+from modeler.system.processes import check_installed, diverted
 from modeler.types import Array, InputError, ObjectModel, areas_m2
 
 SMALLEST_M: Final = 1e-3
@@ -270,7 +267,7 @@ class Preset:
         solids.write_urdf(solid.of, solid.body, solid.parts)
 
         def settles() -> tuple[bool, str]:
-            with _quiet():  # PyBullet writes to stdout by itself
+            with diverted(1):  # PyBullet writes to stdout by itself
                 settled = solids.settled_in_pybullet(solid.of.model(".urdf"), solids.drop_height_m(solid.parts))
             return settled.at_rest, settled.words
 
@@ -449,18 +446,3 @@ class _Solid:
         convex = all(loaded(self.of.part(k)).is_convex for k in range(len(self.parts.meshes)))
         meshes = mesh_checks(self.of.visual, most_triangles=solids.MOST_TRIANGLES).also(convex, "parts convex")
         return meshes.and_also(self.checks())
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress output of compiled code to stdout."""
-    sys.stdout.flush()
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        yield
-    finally:
-        ctypes.CDLL(None).fflush(None)  # buffered output of C
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)

@@ -220,11 +220,6 @@ def calibrated(sequence: AbstractSequence, sensor: Path | None, camera: Path | N
     return sequence if sensor is None else CalibratedSequence(sequence, read_noise(sensor))
 
 
-def estimated_camera(file: Path | None) -> dict[str, float | str] | None:
-    """Return the calibration in a camera file as in report.json; None without one."""
-    return None if file is None else read_focal_factor(file).values()
-
-
 def renumbered(view: RayImage, offset: int, later_s: float = 0.0) -> RayImage:
     """Return a view with another frame number and time."""
     frame = view.frame

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import importlib.util
 import mmap
 import os
 import shlex
 import sys
+import threading
+from collections.abc import Iterator
+from typing import IO
+
+_DIVERTED = threading.Lock()
 
 
 def share_one_heap() -> None:
@@ -36,6 +42,21 @@ def check_room(size: int) -> None:
 def environment() -> dict[str, str]:
     """Return the environment in which Python finds the modules of this process, and none in the current folder."""
     return {**os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))}
+
+
+@contextlib.contextmanager
+def diverted(stream: int, into: IO[bytes] | None = None) -> Iterator[None]:
+    """Keep what compiled code writes to stdout (1) or stderr (2), one for all threads: in a file, or nowhere."""
+    with _DIVERTED, open(os.devnull, "wb") as nowhere:
+        sys.stdout.flush()
+        kept = os.dup(stream)
+        try:
+            os.dup2((nowhere if into is None else into).fileno(), stream)
+            yield
+        finally:
+            ctypes.CDLL(None).fflush(None)  # buffered output of C
+            os.dup2(kept, stream)
+            os.close(kept)
 
 
 def install_command(extra: str) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -65,6 +66,8 @@ class Places:
 class Cylindrical:
     """One image around the z axis, over side-facing surface."""
 
+    count: ClassVar[int] = 1
+    """Number of charts."""
     bottom_m: float | None = None
     """Height in the model frame at which it begins in m; null for that of the lowest point."""
     top_m: float | None = None
@@ -73,11 +76,6 @@ class Cylindrical:
     def __post_init__(self) -> None:
         if self.bottom_m is not None and self.top_m is not None and self.bottom_m >= self.top_m:
             raise ValueError("top_m must be more than bottom_m")
-
-    @property
-    def count(self) -> int:
-        """Number of charts."""
-        return 1
 
     def _heights_m(self, mesh: Mesh) -> tuple[float, float]:
         low, high = mesh.vertices_m[:, 2].min(), mesh.vertices_m[:, 2].max()
@@ -103,10 +101,8 @@ class Cylindrical:
 class Spherical:
     """One image around the middle of the body: columns are meridians, rows circles of latitude."""
 
-    @property
-    def count(self) -> int:
-        """Number of charts."""
-        return 1
+    count: ClassVar[int] = 1
+    """Number of charts."""
 
     def charts(self, mesh: Mesh) -> tuple[Chart, ...]:
         """Return the charts of a mesh."""
@@ -154,10 +150,8 @@ class Faces:
 class Unwrapped:
     """One image mapped by the texture coordinates of the mesh file."""
 
-    @property
-    def count(self) -> int:
-        """Number of charts."""
-        return 1
+    count: ClassVar[int] = 1
+    """Number of charts."""
 
     def charts(self, mesh: Mesh) -> tuple[Chart, ...]:
         """Return the charts of a mesh."""
