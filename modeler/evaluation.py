@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.special import gammaincinv
 
 from modeler import se3
+from modeler.fusion.paint import SurfacePoints
 from modeler.system.pictures import raycaster, tensor
 from modeler.types import Array, BoolArray, Frame, PoseGaussian, areas_m2
 
@@ -267,12 +268,6 @@ def sample_surface(vertices_m: Array, triangles: npt.NDArray[np.int64], count: i
         count: number of points.
         rng: source of randomness.
     """
-    a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
-    area = areas_m2(vertices_m, triangles)
-    if not area.sum() > 0.0:
+    if not areas_m2(vertices_m, triangles).sum() > 0.0:
         raise ValueError("a mesh without area has no surface to sample")
-    chosen = rng.choice(len(triangles), size=count, p=area / area.sum())
-    along, across = rng.random((2, count, 1))
-    fold = along + across > 1.0  # the far half of the parallelogram folds back onto the triangle
-    along, across = np.where(fold, 1.0 - along, along), np.where(fold, 1.0 - across, across)
-    return a[chosen] + along * (b - a)[chosen] + across * (c - a)[chosen]
+    return SurfacePoints.draw(vertices_m, triangles, count, rng).of(vertices_m)

@@ -31,6 +31,7 @@ class SurfacePoints:
         areas = areas_m2(vertices_m, triangles)
         picked = rng.choice(len(triangles), count, p=areas / areas.sum())
         u, v = rng.random((2, count))
+        # The far half of the parallelogram folds back onto the triangle.
         u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
         return cls(picked, triangles[picked], np.stack([1.0 - u - v, u, v], axis=1))
 
