@@ -17,15 +17,7 @@ from modeler.sequences import bundled
 
 BOX = str(bundled("box"))
 QUICK = ("--prior", "table", "--method", "icp")
-FILES = {
-    "model.ply",
-    "cloud.ply",
-    "trajectory.txt",
-    "odometry.txt",
-    "graph.g2o",
-    "recording.rrd",
-    "report.json",
-}
+FILES = {"model.ply", "cloud.ply", "trajectory.txt", "odometry.txt", "graph.g2o", "recording.rrd", "report.json"}
 
 
 class Ended(NamedTuple):

@@ -30,7 +30,7 @@ from modeler.sequences.calibrated import flat_shares
 from modeler.sequences.colour_alignment import misalignment
 from modeler.system import concurrency
 from modeler.types import Frame, Step
-from studies.formats.image_folders import small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
+from studies.formats.image_folders import WRITERS, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 
 survey: Any = sys.modules["modeler.sequences.survey"]  # the module, whose name in its package is its function's
 
@@ -87,6 +87,14 @@ def frames() -> list[Frame]:
 def truth() -> dict[int, np.ndarray]:
     """Return camera_from_model (4, 4) of those frames."""
     return small_truth()
+
+
+@pytest.fixture(params=WRITERS)
+def folder(request: pytest.FixtureRequest, tmp_path: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> Path:
+    """Return a folder of those frames, as one of other programs writes it."""
+    path = tmp_path / request.param
+    WRITERS[request.param](path, frames, truth)
+    return path
 
 
 @pytest.fixture(scope="session")

@@ -20,11 +20,7 @@ from modeler.verdict.advice import estimated_focal_length, remedies, unchecked_f
 
 
 def untrusted(
-    *codes: str,
-    turn_deg: float = 40.0,
-    sigma_deg: float = 1.0,
-    outcome: Outcome = Outcome.CONVERGED,
-    **more: Any,
+    *codes: str, turn_deg: float = 40.0, sigma_deg: float = 1.0, outcome: Outcome = Outcome.CONVERGED, **more: Any
 ) -> dict[str, Any]:
     """What a report says of a run of two frames, of which one may be left out."""
     turn = se3.exp(np.array([0.0, np.radians(turn_deg), 0.0, 0.0, 0.0, 0.0]))
@@ -102,7 +98,7 @@ def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
 
 
 @pytest.mark.parametrize(
-    ("turn_deg", "known", "said"),
+    ("turn_deg", "facts", "said"),
     [
         (150.0, {"trustworthy": True}, "1.5°"),
         (150.0, {"trustworthy": True, "closed": True}, ""),  # the loop checks it
@@ -111,9 +107,9 @@ def test_what_to_do_next_is_the_limit_that_was_hit_or_what_is_missing(
     ],
 )
 def test_a_turn_without_a_loop_tells_what_hangs_on_the_focal_length(
-    turn_deg: float, known: dict[str, Any], said: str
+    turn_deg: float, facts: dict[str, Any], said: str
 ) -> None:
-    words = unchecked_focal_length(untrusted(turn_deg=turn_deg, **known))
+    words = unchecked_focal_length(untrusted(turn_deg=turn_deg, **facts))
     assert said in words
     assert bool(words) is bool(said)
 

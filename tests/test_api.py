@@ -7,8 +7,6 @@ import inspect
 import json
 import os
 import pydoc
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tabletop
+from command_runner import spawned
 
 import modeler
 from modeler import se3
@@ -36,8 +35,7 @@ NUMBERS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
 
 def test_the_package_is_imported_without_what_it_is_made_of() -> None:
     code = "import sys, modeler; print('numpy' in sys.modules, modeler.TablePrior.__name__, 'numpy' in sys.modules)"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ended.stdout.split() == ["False", "TablePrior", "True"]
+    assert spawned("-c", code).out.split() == ["False", "TablePrior", "True"]
 
 
 AWAKE = """
@@ -68,8 +66,7 @@ print(len(blas), all([registered(seed) for seed in range(4)]), sum(map(ticks, bl
 def test_registration_leaves_the_threads_of_blas_asleep() -> None:
     """Once awake, they take cores from the kernels: a pair took a third longer."""
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
-    ended = subprocess.run([sys.executable, "-c", AWAKE], capture_output=True, text=True, check=True, env=environment)
-    threads, usable, ticks = ended.stdout.split()
+    threads, usable, ticks = spawned("-c", AWAKE, env=environment).out.split()
     if threads == "0":
         pytest.skip("BLAS has no threads here")
     assert (usable, ticks) == ("True", "0")
@@ -144,11 +141,11 @@ def test_frames_of_a_generator_become_a_run_folder_with_a_verdict(tmp_path: Path
     assert set(result.solution.trajectory) == {0, 1, 2, 3}
     assert result.report == json.loads((tmp_path / "run" / "report.json").read_text())
     assert {"model.ply", "recording.rrd", "graph.g2o"} <= {path.name for path in (tmp_path / "run").iterdir()}
-    alone = modeler.build(FRAMES, prior="general", registrar=KNOWN)
-    assert alone.folder is None
-    assert alone.report["edges"] == result.report["edges"]
+    single = modeler.build(FRAMES, prior="general", registrar=KNOWN)
+    assert single.folder is None
+    assert single.report["edges"] == result.report["edges"]
     for frame, pose in result.solution.trajectory.items():
-        np.testing.assert_array_equal(alone.solution.trajectory[frame], pose)
+        np.testing.assert_array_equal(single.solution.trajectory[frame], pose)
 
 
 def test_a_live_loop_is_asked_for_a_frame_once_the_one_before_is_processed() -> None:

@@ -15,8 +15,25 @@ from modeler.graph import PoseGraph, Smoother
 from modeler.pipeline.attempts import Search, predicted
 from modeler.pipeline.state import State
 from modeler.priors import AnyMotion, AutoPrior, GeneralPrior, TablePrior, TurntablePrior
-from modeler.types import Edge, JoinsPrevious, Outcome, PoseGaussian, Posterior, Solution
+from modeler.types import Array, Edge, JoinsPrevious, Outcome, PoseGaussian, Posterior, RayImage, Solution
 from modeler.views import Sensor
+
+BODY, POSES = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
+
+
+def seen(*frames: int, poses: list[Array] = POSES) -> dict[int, RayImage]:
+    return {k: Sensor().ray_image(tabletop.view(BODY, poses[k], k).frame) for k in frames}
+
+
+def odometry(source: int, motion: Array, covariance: Array | None = None) -> Edge:
+    pose = PoseGaussian(motion, 1e-6 * np.eye(6) if covariance is None else covariance)
+    posterior = Posterior(source, source - 1, pose, Outcome.CONVERGED, overlap=0.9)
+    return Edge(posterior, "odometry", True, JoinsPrevious(Outcome.CONVERGED, 0.9))
+
+
+def joined(edges: list[Edge], views: dict[int, RayImage]) -> State:
+    graph = PoseGraph(tuple(edges))
+    return State(graph=graph, smoother=Smoother().to(graph), views=views, places={k: k for k in views})
 
 
 def test_it_is_an_even_mixture_of_free_motion_and_motion_on_the_table(rng: np.random.Generator) -> None:
@@ -53,10 +70,8 @@ def test_limits_are_left_only_where_both_were_assumed() -> None:
 def test_pairs_are_registered_within_limits_that_hold_their_predicted_motion(
     turn_deg: float, assumed: bool, kept: bool
 ) -> None:
-    body = tabletop.Box((0.06, 0.045, 0.08))
     poses = tabletop.turntable(360)
-    seen = [tabletop.view(body, poses[k], k) for k in (0, int(turn_deg))]
-    target, source = (Sensor().ray_image(view.frame) for view in seen)
+    target, source = seen(0, int(turn_deg), poses=poses).values()
     prior = GeneralPrior(max_offset_m=0.2, limits_assumed=assumed)
     solution = Solution({target.index: np.eye(4), source.index: poses[0] @ se3.inverse(poses[int(turn_deg)])})
     state = State(smoother=Smoother(solution=solution), views={target.index: target, source.index: source})
@@ -67,16 +82,9 @@ def test_pairs_are_registered_within_limits_that_hold_their_predicted_motion(
 
 def test_pairs_registered_anew_keep_the_steps_that_their_edges_hold() -> None:
     """Those with the previous view; further pairs hold none, as edges in between do."""
-    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
-    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(3)}
-    placed = {k: poses[0] @ se3.inverse(poses[k]) for k in range(3)}
-    edges = []
-    for source, target in ((1, 0), (2, 1)):
-        motion = PoseGaussian(se3.inverse(placed[target]) @ placed[source], 1e-6 * np.eye(6))
-        posterior = Posterior(source, target, motion, Outcome.CONVERGED, overlap=0.9)
-        edges.append(Edge(posterior, "odometry", True, JoinsPrevious(Outcome.CONVERGED, 0.9)))
-    graph = PoseGraph(tuple(edges))
-    state = State(graph=graph, smoother=Smoother().to(graph), views=views, places={k: k for k in views})
+    views = seen(0, 1, 2)
+    placed = {k: POSES[0] @ se3.inverse(POSES[k]) for k in range(3)}
+    state = joined([odometry(k, se3.inverse(placed[k - 1]) @ placed[k]) for k in (1, 2)], views)
     prior = TurntablePrior(24.0, 1.0).learned(state.solution, state.graph.edges)
     for source, target, evidence in ((1, 0, True), (2, 1, True), (2, 0, False)):
         (attempt,) = Search(state, prior, Closer(), views[source], target).attempts("refine")
@@ -88,18 +96,11 @@ def test_pairs_registered_anew_keep_the_steps_that_their_edges_hold() -> None:
 
 
 def test_pairs_that_turn_the_other_way_than_the_rest_are_in_doubt() -> None:
-    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
-    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(6)}
-    step = poses[0] @ se3.inverse(poses[1])
-    edges = []
-    for source in range(1, 6):
-        motion = PoseGaussian(se3.inverse(step) if source == 1 else step, 1e-6 * np.eye(6))
-        posterior = Posterior(source, source - 1, motion, Outcome.CONVERGED, overlap=0.9)
-        edges.append(Edge(posterior, "odometry", True, JoinsPrevious(Outcome.CONVERGED, 0.9)))
-    graph = PoseGraph(tuple(edges))
-    state = State(graph=graph, smoother=Smoother().to(graph), views=views, places={k: k for k in views})
+    step = POSES[0] @ se3.inverse(POSES[1])
+    edges = [odometry(k, se3.inverse(step) if k == 1 else step) for k in range(1, 6)]
+    state = joined(edges, seen(*range(6)))
     prior = TurntablePrior(24.0, 1.0, step_sign="unknown")
-    doubtful = state.less_probable(prior, prior.learned(state.solution, graph.edges))
+    doubtful = state.less_probable(prior, prior.learned(state.solution, state.graph.edges))
     assert doubtful == [edges[0]]
     again = replace(edges[0].posterior, pose=replace(edges[0].posterior.pose, mean=step))
     mended = state.reregistered(doubtful, [again])
@@ -108,35 +109,29 @@ def test_pairs_that_turn_the_other_way_than_the_rest_are_in_doubt() -> None:
 
 
 def test_steps_about_no_common_axis_are_solved_without_one() -> None:
-    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
-    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(6)}
-    views = {k: replace(view, plane=None) for k, view in views.items()}
+    views = {k: replace(view, plane=None) for k, view in seen(*range(6)).items()}
     prior = TurntablePrior(24.0, 1.0)
     for wobble_deg, fits in ((0.0, True), (3.0, False)):
         rng, edges = np.random.default_rng(0), []
         for source in range(1, 6):
             tilt = np.append(np.radians(wobble_deg) * rng.normal(size=3), np.zeros(3))
-            step = se3.moved((poses[source - 1] @ se3.inverse(poses[source]))[None], tilt, views[source].centroid_m)[0]
-            spread = se3.covariance_about(1e-6 * np.eye(6), -views[source].centroid_m)
-            posterior = Posterior(source, source - 1, PoseGaussian(step, spread), Outcome.CONVERGED, overlap=0.9)
-            edges.append(Edge(posterior, "odometry", True, JoinsPrevious(Outcome.CONVERGED, 0.9)))
-        graph = PoseGraph(tuple(edges))
-        state = State(graph=graph, smoother=Smoother().to(graph), views=views, places={k: k for k in views})
+            step = se3.moved((POSES[source - 1] @ se3.inverse(POSES[source]))[None], tilt, views[source].centroid_m)[0]
+            edges.append(odometry(source, step, se3.covariance_about(1e-6 * np.eye(6), -views[source].centroid_m)))
+        state = joined(edges, views)
         assert (state.about_axis(prior) is not None) is fits
         assert replace(state, spans=(edges[0],)).about_axis(prior) is None
         assert state.about_axis(GeneralPrior()) is None
 
 
-def test_an_edge_to_another_view_that_contradicts_what_was_told_does_not_place_a_view() -> None:
-    body, poses = tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(15)
-    views = {k: Sensor().ray_image(tabletop.view(body, poses[k], k).frame) for k in range(4)}
-    placed = {k: poses[0] @ se3.inverse(poses[k]) for k in range(3)}
+def test_an_edge_to_another_view_that_contradicts_what_was_given_does_not_place_a_view() -> None:
+    views = seen(*range(4))
+    placed = {k: POSES[0] @ se3.inverse(POSES[k]) for k in range(3)}
     state = State(smoother=Smoother(solution=Solution(placed)), views=views, places={k: k for k in views})
 
     def found(prior: TurntablePrior | GeneralPrior, target: int, true: int) -> bool:
         """Return whether frame 3 may be placed by a match with a view that is the true one with another."""
         search = Search(state, prior, Closer(), views[3], 2)
-        motion = PoseGaussian(poses[0] @ se3.inverse(poses[true]), 1e-6 * np.eye(6))
+        motion = PoseGaussian(POSES[0] @ se3.inverse(POSES[true]), 1e-6 * np.eye(6))
         search.found[target] = Posterior(3, target, motion, Outcome.CONVERGED, overlap=0.9)
         return bool(search.candidates)
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import open3d as o3d
 import pytest
 import small_gicp
 import tabletop
@@ -91,6 +92,14 @@ class AnyTurn(AbstractPoseDensity):
 
     def log_density(self, target_from_source: Array) -> Array:
         raise NotImplementedError
+
+
+def of_open3d(cloud: Cloud) -> o3d.geometry.PointCloud:
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
+    points.normals = o3d.utility.Vector3dVector(cloud.normals)
+    if cloud.intensity is not None:
+        points.colors = o3d.utility.Vector3dVector(np.repeat(cloud.intensity[:, None], 3, axis=1))
+    return points
 
 
 def degrees_between(first: Array, second: Array) -> float:
@@ -196,23 +205,16 @@ def test_information_is_true_where_residuals_are_independent_and_partners_true(r
 
 
 def test_icp_stops_where_open3d_would(pair: Pair, rng: np.random.Generator) -> None:
-    import open3d as o3d
-
     method = IcpRegistrar()
     source, target = (Cloud.of(view) for view in pair)
     initial = start(pair[0], pair[1], GeneralPrior(40.0, 0.03).between(*pair), rng)
     fit = method.refine(source, target, initial.target_from_source)
     voxel_m = cube_edges_m(source, target, method.voxels)[-1]
     reach_m = method.reach * voxel_m
-    clouds = []
-    for cloud in (source.thinned(voxel_m), target.thinned(voxel_m)):
-        points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
-        points.normals = o3d.utility.Vector3dVector(cloud.normals)
-        clouds.append(points)
     library = o3d.pipelines.registration
     theirs = library.registration_icp(
-        clouds[0],
-        clouds[1],
+        of_open3d(source.thinned(voxel_m)),
+        of_open3d(target.thinned(voxel_m)),
         reach_m,
         fit.target_from_source,
         library.TransformationEstimationPointToPlane(library.TukeyLoss(reach_m)),
@@ -243,23 +245,14 @@ def test_coloured_icp_sees_a_printed_ball_turn(rng: np.random.Generator) -> None
 
 
 def test_coloured_icp_stops_where_open3d_would() -> None:
-    import open3d as o3d
-
     method = ColouredIcpRegistrar()
     source, target = (Cloud.coloured(printed_ball(turn_deg, seed)) for turn_deg, seed in ((0.0, 0), (3.0, 1)))
     voxel_m = 0.004
     thin = source.thinned(voxel_m), target.thinned(voxel_m)
     reach_m = method.reach * voxel_m
-    clouds = []
-    for cloud in thin:
-        points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m))
-        points.normals = o3d.utility.Vector3dVector(cloud.normals)
-        points.colors = o3d.utility.Vector3dVector(np.repeat(cloud.intensity[:, None], 3, axis=1))
-        clouds.append(points)
     library = o3d.pipelines.registration
     theirs = library.registration_colored_icp(
-        clouds[0],
-        clouds[1],
+        *map(of_open3d, thin),
         reach_m,
         np.eye(4),
         library.TransformationEstimationForColoredICP(),

@@ -185,12 +185,8 @@ def manifest(folder: Path, text: str) -> Path:
 def test_rows_of_a_manifest_have_options_of_their_own(cli: Run, tmp_path: Path) -> None:
     for name in "ab":
         sequence(tmp_path / name)
-    path = manifest(
-        tmp_path,
-        "sequence,name,prior,step_deg,roi,colour\n"
-        f"{tmp_path / 'a'},cup,turntable,-24,1 2 3 4,no\n"
-        f"{tmp_path / 'b'},,,,,yes\n",
-    )
+    cells = f"{tmp_path / 'a'},cup,turntable,-24,1 2 3 4,no\n{tmp_path / 'b'},,,,,yes\n"
+    path = manifest(tmp_path, f"sequence,name,prior,step_deg,roi,colour\n{cells}")
     assert cli("batch", "--manifest", path, "--out", tmp_path / "out", "--prior", "table").status == 0
     notes = {note.stem: json.loads(note.read_text()) for note in (tmp_path / "out" / NOTES).glob("*.json")}
     assert notes.keys() == {"cup", "b"}
@@ -230,15 +226,10 @@ def test_a_manifest_that_cannot_be_used_is_refused(refusal: Callable[..., str], 
 def test_options_that_cannot_be_used_are_refused(cli: Run, refusal: Callable[..., str], tmp_path: Path) -> None:
     folder = sequence(tmp_path / "s")
     (tmp_path / "my_engines.py").write_text("def none(workers):\n    return workers\n")
-    for options in (
-        (),
-        (folder, "--workers", "0"),
-        (folder, "--executor", "kubernetes"),
-        (folder, "--executor", "dask:"),
-        (folder, "--executor", "no_such_module:thing"),
-        (folder, folder),
-    ):
-        refusal("batch", *options, "--out", tmp_path / "out")
+    refusal("batch", "--out", tmp_path / "out")
+    executors = [("--executor", name) for name in ("kubernetes", "dask:", "no_such_module:thing")]
+    for options in (("--workers", "0"), (folder,), *executors):
+        refusal("batch", folder, *options, "--out", tmp_path / "out")
     assert cli("batch", folder, "--out", folder / "out").status == 2
     assert cli("batch", folder, "--out", folder).status == 2
     assert sorted(path.name for path in folder.iterdir()) == ["given.json"]
@@ -434,15 +425,11 @@ def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
         read_table(tmp_path / TABLE)
 
 
-def test_a_row_of_a_manifest_may_say_what_its_input_does_not(tmp_path: Path) -> None:
-    (row,) = read_manifest(manifest(tmp_path, "sequence,depth-scale-mm,along-ray\na,0.5,yes\n"))
-    assert row.arguments == ("--depth-scale-mm", "0.5", "--along-ray")
-
-
-def test_a_manifest_may_come_from_a_spreadsheet(tmp_path: Path) -> None:
+def test_a_manifest_may_come_from_a_spreadsheet_and_say_what_its_input_does_not(tmp_path: Path) -> None:
     path = tmp_path / "list.csv"
-    path.write_bytes('\ufeffsequence,prior\r\n"a, b",table\r\n'.encode())
-    assert read_manifest(path) == [Row(Path("a, b"), f"{path}: row 2", "", ("--prior", "table"))]
+    path.write_bytes('\ufeffsequence,depth-scale-mm,along-ray\r\n"a, b",0.5,yes\r\n'.encode())
+    options = ("--depth-scale-mm", "0.5", "--along-ray")
+    assert read_manifest(path) == [Row(Path("a, b"), f"{path}: row 2", "", options)]
 
 
 @pytest.fixture

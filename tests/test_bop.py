@@ -245,12 +245,7 @@ def test_depth_of_other_formats_is_refused_by_name(scene: Path, suffix: str) -> 
 
 
 def edit_json(name: str, change: Callable[[dict], object]) -> Callable[[Path], object]:
-    def damage(scene: Path) -> None:
-        content = json.loads((scene / name).read_text())
-        change(content)
-        (scene / name).write_text(json.dumps(content))
-
-    return damage
+    return lambda scene: entered(scene, name, change)
 
 
 def write(name: str, content: bytes) -> Callable[[Path], object]:

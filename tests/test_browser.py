@@ -76,11 +76,11 @@ def test_the_report_draws_the_model_and_turns_it(run: Path, page: Page) -> None:
     with_cameras = page.picture()[inside].astype(int)
     assert np.any(np.abs(with_cameras - after).max(axis=2) > 25)
     page.value("document.getElementById('cameras').click()")
-    alone = page.picture()[inside].astype(int)
+    bare = page.picture()[inside].astype(int)
     page.value("chosen = document.getElementById('paint'); chosen.value = 'plain'")
     page.value("chosen.dispatchEvent(new Event('change'))")
     plain = page.picture()[inside].astype(int)
-    assert np.mean(np.abs(plain - alone).max(axis=2) > 5) > 0.01
+    assert np.mean(np.abs(plain - bare).max(axis=2) > 5) > 0.01
     page.value("document.querySelector('.mask button').click()")
     assert page.value("document.querySelector('#large[open] img').getBoundingClientRect().width") > 700.0
     page.value("document.getElementById('large').click()")

@@ -33,10 +33,10 @@ def test_every_command_has_help_on_stdout(cli: Run, command: str) -> None:
 
 
 def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tells_all(cli: Run) -> None:
-    overall, alone = (" ".join(cli(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
-    for text in (overall, alone):
+    overall, single = (" ".join(cli(*words, "--help").out.replace("│", " ").split()) for words in ((), ("build",)))
+    for text in (overall, single):
         assert "Build the model of an object from a sequence: register its frames, close loops, fuse." in text
-    assert "Ctrl-C" in alone
+    assert "Ctrl-C" in single
     assert "Ctrl-C" not in overall
 
 

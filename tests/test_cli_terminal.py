@@ -160,7 +160,7 @@ def test_a_terminal_sees_what_to_do_next_while_frames_come(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     growing = shutil.copytree(scene, tmp_path / "box")
-    command = [*COMMAND, "build", str(growing), "--watch", "--idle-s", "6", "--out", str(tmp_path / "run"), *QUICK]
+    command = [*COMMAND, "build", str(growing), "--watch", "--idle-s", "3", "--out", str(tmp_path / "run"), *QUICK]
     said = on_a_terminal(lambda: subprocess.run(command, stderr=sys.stderr, check=True), monkeypatch)
     assert "next: turn by " in said
 

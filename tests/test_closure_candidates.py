@@ -61,12 +61,12 @@ def test_the_expected_gain_falls_with_rotation_and_with_the_doubt_that_the_edge_
     map_view, _ = chain([8.0 * k for k in range(7)])
     by_angle = [gains(map_view, angle_deg) for angle_deg in (10.0, 20.0, 40.0)]
     within, on_the_limit = by_angle[2], gains(map_view, 40.0, max_angle_deg=40.0)
-    steeper, known = gains(map_view, 40.0, power=6.0), gains(map_view, 40.0, has_own_edge=True)
+    steeper, given = gains(map_view, 40.0, power=6.0), gains(map_view, 40.0, has_own_edge=True)
     drifting = gains(map_view, 40.0, systematic=30.0 * SYSTEMATIC)
     for frame in FRAMES:
         assert by_angle[0][frame].gain_nats > by_angle[1][frame].gain_nats > within[frame].gain_nats
         assert on_the_limit[frame].gain_nats == pytest.approx(0.5 * within[frame].gain_nats, rel=1e-3)
-        assert steeper[frame].gain_nats < within[frame].gain_nats < known[frame].gain_nats
+        assert steeper[frame].gain_nats < within[frame].gain_nats < given[frame].gain_nats
         # Drift as long as the path, and in the new edge, is like noise of edges: more of both changes nothing.
         assert drifting[frame].gain_nats == pytest.approx(within[frame].gain_nats, rel=1e-5)
 

@@ -66,8 +66,8 @@ def test_light_by_way_of_other_surfaces_makes_time_of_flight_read_too_far() -> N
     empty = World((CUBE, FACES), (floor, np.zeros((0, 3), dtype=np.int64)))
     camera = TimeOfFlight()
     face = camera.look(beside).on_object
-    near, alone = (camera.measure(world, np.random.default_rng(1), 0)[face] for world in (beside, empty))
-    assert np.median(near) - np.median(alone) > 0.0005
+    near, isolated = (camera.measure(world, np.random.default_rng(1), 0)[face] for world in (beside, empty))
+    assert np.median(near) - np.median(isolated) > 0.0005
 
 
 def _trial(squares: float, **changes: object) -> Trial:
@@ -87,12 +87,12 @@ def test_volumes_are_compared_at_the_same_coverage() -> None:
 
 def test_the_standard_error_of_a_mean_allows_for_correlation_within_shapes() -> None:
     rng = np.random.default_rng(0)
-    of_shapes, alone = rng.normal(size=(2, 400))
+    of_shapes, independent = rng.normal(size=(2, 400))
     shapes = [str(number) for number in range(400)]
-    assert standard_error(alone, shapes) == pytest.approx(1.0 / np.sqrt(400.0), rel=0.1)
+    assert standard_error(independent, shapes) == pytest.approx(1.0 / np.sqrt(400.0), rel=0.1)
     repeated = standard_error(np.repeat(of_shapes, 3), [shape for shape in shapes for _ in range(3)])
     assert repeated == pytest.approx(standard_error(of_shapes, shapes))
-    assert np.isnan(standard_error(alone, ["box"] * 400))
+    assert np.isnan(standard_error(independent, ["box"] * 400))
 
 
 def test_conformal_factors_make_regions_hold_the_truth_that_were_too_small(tmp_path: Path) -> None:

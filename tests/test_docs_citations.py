@@ -70,11 +70,11 @@ def test_index_lists_the_chapters_in_order() -> None:
 
 
 def test_citations_of_equations_resolve() -> None:
-    known, count, wrong = all_labels(), 0, []
+    labels, count, wrong = all_labels(), 0, []
     for path, text in texts():
         cited = citations(text)
         count += len(cited)
-        wrong += [f"{path.relative_to(ROOT)}: eq. {label}" for label in cited if label not in known]
+        wrong += [f"{path.relative_to(ROOT)}: eq. {label}" for label in cited if label not in labels]
     assert not wrong
     assert count > 100  # the pattern still finds them
 
@@ -93,10 +93,10 @@ def test_citations_are_found(text: str, cited: list[str]) -> None:
 
 
 def test_chapters_refer_to_equations_that_exist() -> None:
-    known = all_labels()
+    labels = all_labels()
     for path in chapters().values():
         referred = re.findall(r"\(([1-9]\d*\.\d+)\)", _FENCE.sub("", path.read_text()))
-        assert set(referred) <= known, path.name
+        assert set(referred) <= labels, path.name
 
 
 def test_links_to_chapters_resolve() -> None:

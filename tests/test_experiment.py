@@ -10,6 +10,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,18 +83,13 @@ def test_limits_that_are_assumed_are_left_as_a_registration_leaves_them(*, assum
 @pytest.mark.parametrize("method", [Oracle(), ContradictedWithin()])
 def test_a_trial_is_what_register_gives_of_the_pair(method: AbstractRegistrar, assumed: bool) -> None:
     prior, recording, sensor = GeneralPrior(limits_assumed=assumed), Recording(), Sensor(SensorNoise(0.002, 0.001))
-    single = Modeler(prior=prior, registrar=method, sensor=sensor, seed=3)
+    single: Any = Modeler(prior=prior, registrar=method, sensor=sensor, seed=3)
     scene = single.segmenter.scene([recording.frame(index) for index in recording.indices])
     for found in experiment(methods={"one": method}, prior=prior, seed=3).trials(recording):
-        views = [single.prepare(recording.frame(index), scene).view for index in (found.source, found.target)]
-        assert views[0] is not None
-        assert views[1] is not None
-        posterior = single.register(views[0], views[1])
-        assert (found.outcome, found.usable, found.seconds) == (
-            posterior.outcome.label,
-            posterior.usable,
-            posterior.seconds,
-        )
+        source, target = (single.prepare(recording.frame(index), scene).view for index in (found.source, found.target))
+        posterior = single.register(source, target)
+        stated = posterior.outcome.label, posterior.usable, posterior.seconds
+        assert (found.outcome, found.usable, found.seconds) == stated
         np.testing.assert_array_equal(found.target_from_source, posterior.pose.mean.ravel())
         assert found.seconds == (0.5 if assumed and isinstance(method, ContradictedWithin) else 0.25)
 
@@ -307,21 +303,21 @@ def test_same_seed_writes_the_same_files(tmp_path: Path) -> None:
         assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "again" / file).read_bytes()
 
 
-def test_refuses_sequences_without_truth_before_it_begins(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"dark: .*scene_gt\.json"):
-        run(tmp_path / "out", Recording(), Recording(name="dark", known=False))
-    assert not (tmp_path / "out").exists()
-
-
-def test_refuses_two_sequences_of_one_name(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="two sequences are called 'box'"):
-        run(tmp_path / "out", Recording(), Recording())
-
-
-def test_refuses_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("out", "recordings", "says"),
+    [
+        ("out", (Recording(), Recording(name="dark", known=False)), r"dark: .*scene_gt\.json"),
+        ("out", (Recording(), Recording()), "two sequences are called 'box'"),
+        ("file/out", (), "`out`"),
+    ],
+)
+def test_refuses_what_it_cannot_judge_or_write_before_it_begins(
+    tmp_path: Path, out: str, recordings: tuple[Recording, ...], says: str
+) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="`out`"):
-        run(tmp_path / "file" / "out")
+    with pytest.raises(InputError, match=says):
+        run(tmp_path / out, *recordings)
+    assert not (tmp_path / out).exists()
 
 
 @pytest.mark.parametrize("trials", [[], [trial(0.0)], [trial(math.nan)], [trial(1e-9), trial(180.0, usable=False)]])

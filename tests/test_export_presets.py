@@ -47,8 +47,8 @@ def test_mass_and_inertia_of_a_box_are_those_of_the_closed_form_in_any_pose(rng:
         expected = pose[:3, :3] @ box_inertia(mass) @ pose[:3, :3].T
         np.testing.assert_allclose(body.inertia_kg_m2, expected, atol=1e-9 * mass)
         assert solids.is_possible_inertia(body.inertia_kg_m2)
-        known = solids.body_of(brick(pose), density_kg_m3=1.0, mass_kg=2.0)
-        np.testing.assert_allclose(known.inertia_kg_m2, expected * 2.0 / mass, atol=1e-9)
+        given = solids.body_of(brick(pose), density_kg_m3=1.0, mass_kg=2.0)
+        np.testing.assert_allclose(given.inertia_kg_m2, expected * 2.0 / mass, atol=1e-9)
     assert not solids.is_possible_inertia(np.diag([1.0, 1.0, 2.1]))
     assert not solids.is_possible_inertia(np.diag([-1.0, 1.0, 1.0]))
 
@@ -259,13 +259,13 @@ def test_checks_tell_what_does_not_hold(tmp_path: Path) -> None:
 
 
 def test_both_bop_exports_have_one_frame(cli: Run, built: Path, tmp_path: Path) -> None:
-    alone, preset = tmp_path / "models" / "obj_000001.ply", tmp_path / "bop"
-    assert cli("export", built, "--bop", "--out", alone).status == 0
+    single, preset = tmp_path / "models" / "obj_000001.ply", tmp_path / "bop"
+    assert cli("export", built, "--bop", "--out", single).status == 0
     assert cli("export", built, "--for", "bop", "--out", preset).status == 0
-    one, other = (trimesh.load_mesh(path) for path in (alone, preset / "models" / "obj_000001.ply"))
+    one, other = (trimesh.load_mesh(path) for path in (single, preset / "models" / "obj_000001.ply"))
     np.testing.assert_allclose(one.bounds, other.bounds, atol=0.5)  # mm; the preset fuses again
     entries = [json.loads(path.with_name("models_info.json").read_text())["1"] for path in (
-        alone, preset / "models" / "obj_000001.ply"
+        single, preset / "models" / "obj_000001.ply"
     )]  # fmt: skip
     np.testing.assert_allclose(*(entry["object_from_mesh"] for entry in entries), atol=5e-4)
 

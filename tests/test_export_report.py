@@ -13,12 +13,7 @@ from ring_graphs import OBJECT_M, edge, spin
 from run_builders import META, made_up_steps, strict_json, with_records
 
 from modeler import se3
-from modeler.export import (
-    RunFolder,
-    edge_record,
-    edges_of,
-    poses_of,
-)
+from modeler.export import RunFolder, edge_record, edges_of, poses_of
 from modeler.export.report import undetermined
 from modeler.graph import PoseGraph, solve
 from modeler.types import (

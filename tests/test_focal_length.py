@@ -128,8 +128,8 @@ def test_a_single_sample_depends_on_no_focal_length(rng: np.random.Generator) ->
     found = AdaptiveSampler(samples=100).run(
         Free(), lambda poses, log_focal: np.zeros(len(poses)), CENTRE_M, rng, nuisance=FocalNuisance(0.02, np.zeros(6))
     )
-    alone = replace(found, weights=np.eye(len(found.weights))[3])
-    np.testing.assert_array_equal(alone.conditional(CENTRE_M).poses, alone.poses)
+    single = replace(found, weights=np.eye(len(found.weights))[3])
+    np.testing.assert_array_equal(single.conditional(CENTRE_M).poses, single.poses)
 
 
 def test_poses_are_scored_under_a_focal_length_as_views_that_were_made_with_it() -> None:

@@ -15,13 +15,7 @@ from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 from modeler import se3
 from modeler.fusion import Fuser, meshing
 from modeler.sequences.bop import BopSequence
-from modeler.types import (
-    Frame,
-    InputError,
-    ObjectModel,
-    RayImage,
-    areas_m2,
-)
+from modeler.types import Array, BoolArray, Frame, InputError, ObjectModel, RayImage, areas_m2
 from modeler.views import Sensor
 
 VOXEL_M = 0.0025
@@ -53,6 +47,19 @@ def on_surface(model: ObjectModel, count: int = 20000):
 
 def same(one: ObjectModel, other: ObjectModel) -> bool:
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
+
+
+def on_top(points_m: Array) -> BoolArray:
+    """Return which points (n, 3) are on the brick's top, away from its edges."""
+    return (np.abs(points_m[:, :2]) < [0.05, 0.03]).all(axis=1) & (points_m[:, 2] > 0.035)
+
+
+def colours_of(view: RayImage) -> Array:
+    return view.frame.colour.astype(np.float64)
+
+
+def recoloured(view: RayImage, colour: Array | None) -> RayImage:
+    return replace(view, frame=replace(view.frame, colour=None if colour is None else np.rint(colour).astype(np.uint8)))
 
 
 # The zero level.
@@ -212,18 +219,14 @@ def test_what_other_views_see_through_is_carved(ball):
 
 
 def test_colours_are_those_of_the_surface(brick):
-    assert brick.vertex_colours is not None
-    assert brick.colours is not None
     for points, colours in ((brick.vertices_m, brick.vertex_colours), (brick.points_m, brick.colours)):
-        top = (np.abs(points[:, 0]) < 0.05) & (np.abs(points[:, 1]) < 0.03) & (points[:, 2] > 0.03)
+        top = on_top(points)
         assert top.sum() > 100
         assert np.abs(colours[top].astype(int) - [128, 128, 228]).max() <= 2
 
 
 def test_without_colour_the_model_has_none(ball):
-    views = {
-        k: replace(view, frame=replace(view.frame, colour=None)) for k, view in tabletop.views(BALL, POSES).items()
-    }
+    views = {k: recoloured(view, None) for k, view in tabletop.views(BALL, POSES).items()}
     model = FUSER.fuse(views, tabletop.trajectory(POSES))
     assert model.colours is None
     assert model.vertex_colours is None
@@ -265,7 +268,6 @@ def test_a_view_that_looks_elsewhere_changes_nothing_and_one_of_nothing_neither(
 
 def test_a_handful_of_pixels_is_no_reason_to_fail():
     view = tabletop.views(BALL, POSES)[0]
-    assert view.frame.mask is not None
     mask = np.zeros_like(view.frame.mask)
     mask[tuple(view.pixels[100:103].T)] = True
     few = tabletop.seen(replace(view.frame, mask=mask), view.normals[100:103], view.sigma_r_m)
@@ -273,7 +275,6 @@ def test_a_handful_of_pixels_is_no_reason_to_fail():
     assert model.triangles.shape == (len(model.triangles), 3)
     assert np.isfinite(model.vertices_m).all()
     preview = FUSER.preview({0: few}, {0: np.eye(4)})
-    assert preview is not None
     assert np.isfinite(preview.points_m).all()
 
 
@@ -284,7 +285,6 @@ def test_the_preview_is_the_surface_at_every_step():
     for count in (1, 3, len(views)):
         some = dict(list(views.items())[:count])
         model = FUSER.preview(some, trajectory)
-        assert model is not None
         assert len(model.points_m) > points
         points = len(model.points_m)
         np.testing.assert_array_equal(model.points_m, model.vertices_m)
@@ -336,7 +336,6 @@ def test_the_voxels_follow_the_pixels_and_stay_within_their_number(ball):
 
 def test_a_vertex_knows_who_saw_it_and_how_far_off_it_may_be(rng):
     model = fused(BRICK, rng=rng)
-    assert model.vertex_views is not None
     assert model.vertex_sigmas_m is not None
     assert np.array_equal(model.vertex_views == 0, ~np.isfinite(model.vertex_sigmas_m))
     flat = np.sort(np.abs(model.vertices_m) - BRICK.half_m, axis=1)[:, 1] < -5e-3  # away from the edges
@@ -358,8 +357,7 @@ def test_a_pose_that_is_unsure_counts_less():
     blind, warned = FUSER.fuse(views, off), FUSER.fuse(views, off, covariances)
 
     def error(model):
-        top = (model.vertices_m[:, 2] > 0.035) & (np.abs(model.vertices_m[:, :2]) < [0.06, 0.04]).all(axis=1)
-        return np.abs(model.vertices_m[top, 2] - BRICK.half_m[2]).mean()
+        return np.abs(model.vertices_m[on_top(model.vertices_m), 2] - BRICK.half_m[2]).mean()
 
     assert error(blind) > 1e-4
     assert error(warned) < 0.3 * error(blind)
@@ -371,21 +369,16 @@ def test_a_view_that_many_contradict_counts_less():
     off = {k: pose for k, pose in tabletop.trajectory(POSES).items()}
     off[3] = se3.translation(np.array([0.0, 0.0, 2e-3])) @ off[3]
     views = tabletop.views(BRICK, POSES, np.random.default_rng(0))
-    model = FUSER.fuse(views, off)
-    right = FUSER.fuse(views, tabletop.trajectory(POSES))
-    heights_m = []
-    for one in (model, right):
-        top = (one.vertices_m[:, 2] > 0.035) & (np.abs(one.vertices_m[:, :2]) < [0.06, 0.04]).all(axis=1)
-        heights_m.append(np.mean(one.vertices_m[top, 2]))
-    assert abs(heights_m[0] - heights_m[1]) < 0.75 * 2e-3 / len(POSES)  # of the shift of a mean
-
-
-def dimmed(view: RayImage, factor: float) -> RayImage:
-    return replace(view, frame=replace(view.frame, colour=(view.frame.colour * factor).astype(np.uint8)))
+    models = FUSER.fuse(views, off), FUSER.fuse(views, tabletop.trajectory(POSES))
+    wrong_m, right_m = (np.mean(model.vertices_m[on_top(model.vertices_m), 2]) for model in models)
+    assert abs(wrong_m - right_m) < 0.75 * 2e-3 / len(POSES)  # of the shift of a mean
 
 
 def test_differences_of_exposure_are_evened_out(brick):
-    views = {k: dimmed(view, 0.6 if k % 3 == 0 else 0.9) for k, view in tabletop.views(BRICK, POSES).items()}
+    views = {
+        k: recoloured(view, colours_of(view) * (0.6 if k % 3 == 0 else 0.9))
+        for k, view in tabletop.views(BRICK, POSES).items()
+    }
     model = FUSER.fuse(views, tabletop.trajectory(POSES))
     ratio = np.log(model.vertex_colours / brick.vertex_colours).mean(axis=1)
     assert np.std(ratio) < 0.03  # against 0.2 between the frames
@@ -396,17 +389,14 @@ def test_what_a_lamp_shades_in_turn_gets_one_colour() -> None:
     """A lamp to the right of the camera: every side of what turns before it is bright in one view, dark in another."""
 
     def lit(view: RayImage) -> RayImage:
-        assert view.frame.colour is not None
-        colour = view.frame.colour.astype(float)
+        colour = colours_of(view)
         colour[tuple(view.pixels.T)] *= 0.5 + 0.5 * np.clip(view.normals @ [0.8, 0.0, -0.6], 0.0, None)[:, None]
-        return replace(view, frame=replace(view.frame, colour=np.rint(colour).astype(np.uint8)))
+        return recoloured(view, colour)
 
     poses = tabletop.trajectory(POSES)
     views = dict(list(tabletop.views(tabletop.Sphere(0.05), POSES).items())[::3])
     even, shaded = FUSER.fuse(views, poses), FUSER.fuse({k: lit(view) for k, view in views.items()}, poses)
-    assert even.vertex_colours is not None
-    assert shaded.vertex_colours is not None
-    ratio = np.log(shaded.vertex_colours / even.vertex_colours).mean(axis=1)
+    ratio = np.log(shaded.vertex_colours.astype(float) / even.vertex_colours.astype(float)).mean(axis=1)
     # What lamps do from above, no turn about an upright axis tells: each ring of one height is compared with itself.
     rings = np.rint(5.0 * even.vertex_normals @ (poses[0][:3, :3] @ POSES[0][:3, 2])).astype(int)
     of_ring = {ring: ratio[rings == ring].mean() for ring in np.unique(rings)}
@@ -416,9 +406,9 @@ def test_what_a_lamp_shades_in_turn_gets_one_colour() -> None:
 
 def test_highlights_of_single_views_leave_no_trace(brick):
     def shining(view: RayImage) -> RayImage:
-        colour = view.frame.colour.copy()
+        colour = colours_of(view)
         colour[tuple(view.pixels[: len(view.pixels) // 8].T)] = 235
-        return replace(view, frame=replace(view.frame, colour=colour))
+        return recoloured(view, colour)
 
     views = {k: shining(view) if k % 5 == 0 else view for k, view in tabletop.views(BRICK, POSES).items()}
     model = FUSER.fuse(views, tabletop.trajectory(POSES))
@@ -429,9 +419,7 @@ def test_colours_count_less_where_they_may_be_those_of_the_background(monkeypatc
     """Colour that is 4 px beside its depth: what one view sees at its silhouette, another sees within."""
     poses, views = tabletop.trajectory(POSES), tabletop.views(PLATE, POSES)
     true = FUSER.fuse(views, poses)
-    for index, view in views.items():
-        assert view.frame.colour is not None
-        views[index] = replace(view, frame=replace(view.frame, colour=np.roll(view.frame.colour, 4, axis=1)))
+    views = {k: recoloured(view, np.roll(colours_of(view), 4, axis=1)) for k, view in views.items()}
     off = {}
     for bleeding_px in (10.0, 0.01):
         monkeypatch.setattr("modeler.fusion.depth_views.BLEEDING_PX", bleeding_px)
@@ -443,11 +431,10 @@ def test_colours_count_less_where_they_may_be_those_of_the_background(monkeypatc
 
 def test_a_view_without_colour_leaves_the_colours_to_others(brick):
     views = tabletop.views(BRICK, POSES)
-    views[4] = replace(views[4], frame=replace(views[4].frame, colour=None))
+    views[4] = recoloured(views[4], None)
     trajectory = tabletop.trajectory(POSES)
     for model in (FUSER.fuse(views, trajectory), FUSER.preview(views, trajectory)):
-        top = (np.abs(model.points_m[:, :2]) < [0.05, 0.03]).all(axis=1) & (model.points_m[:, 2] > 0.03)
-        assert np.abs(model.colours[top].astype(int) - [128, 128, 228]).max() <= 2
+        assert np.abs(model.colours[on_top(model.points_m)].astype(int) - [128, 128, 228]).max() <= 2
 
 
 def test_what_stands_right_before_the_background_is_carved():

@@ -23,16 +23,7 @@ from modeler.fusion.depth_views import (
     view_blocks,
 )
 from modeler.fusion.support import exposure_of
-from modeler.types import (
-    Array,
-    Edge,
-    Outcome,
-    PoseGaussian,
-    Posterior,
-    RayImage,
-    Solution,
-    Stated,
-)
+from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, RayImage, Solution, Stated
 
 WHOLE = slice(0, tabletop.CAMERA.height), slice(0, tabletop.CAMERA.width)
 CORNERS_M = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])

@@ -123,14 +123,14 @@ def test_runs_that_others_have_closed_are_named_and_left_out(cli: Run) -> None:
             if user == 0:
                 os.seteuid(65534)
             done = cli("gallery", place, "--out", Path(place) / "other.html")
-            alone = cli("view", Path(place) / "other")
+            refused = cli("view", Path(place) / "other")
         finally:
             os.seteuid(user)
             (Path(place) / "other").chmod(0o700)
     assert done.status == 0
     assert re.findall(r"modeler: (.*): cannot be read \(Permission denied\)", done.err) == ["other"]
-    assert alone.status == 2
-    assert "Permission denied" in alone.err
+    assert refused.status == 2
+    assert "Permission denied" in refused.err
 
 
 @needs_chromium
@@ -156,9 +156,9 @@ def test_models_are_sorted_and_filtered(cli: Run, folder: Path, page: Page) -> N
     assert choose(status="", words="OPEN") == named([k for k in everyone if k % 5 == 0])
     assert choose(words="0042") == ["model-0042"]
     width = page.value("[...document.getElementById('column').options].find((one) => one.text == 'width').value")
-    known = [k for k in everyone if k % 10 != 9]
-    by_width = sorted(known, key=lambda k: ((k * 37) % COUNT, k))
-    assert choose(words="", column=width)[: len(known)] == named(by_width)
+    built = [k for k in everyone if k % 10 != 9]
+    by_width = sorted(built, key=lambda k: ((k * 37) % COUNT, k))
+    assert choose(words="", column=width)[: len(built)] == named(by_width)
     assert choose(least=100, most=120) == named([k for k in by_width if 100 <= (k * 37) % COUNT <= 120])
     seconds = page.value("[...document.getElementById('column').options].find((one) => one.text == 'build time').value")
     order = choose(least="", most="", column=seconds)

@@ -91,22 +91,22 @@ def test_perfect_table_has_no_slip_and_shows_its_axis() -> None:
 
 def test_trajectory_gains_by_the_axis_and_stays_calibrated() -> None:
     seeds = 60
-    alone, together, first, first_alone = (np.zeros(seeds) for _ in range(4))
+    without, together, first, first_without = (np.zeros(seeds) for _ in range(4))
     poses, near = np.zeros(seeds), np.zeros(seeds)
     for seed in range(seeds):
         rng = np.random.default_rng([7, seed])
         truth, _ = _table(rng)
         graph = _graph(rng, truth)
         plain, solution = solve(graph, {}), solve(graph, {}, axis=TABLE)
-        alone[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
-        first_alone[seed], first[seed] = (
+        without[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
+        first_without[seed], first[seed] = (
             float(se3.rotation_angle(se3.inverse(truth[1]) @ s.trajectory[1])) for s in (plain, solution)
         )
         k = 1 + seed % (COUNT - 1)
         poses[seed] = nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), truth[k])
         near[seed] = nees(solution.relative_gaussian(k - 1, k), se3.inverse(truth[k - 1]) @ truth[k])
-    assert np.median(together) < 0.8 * np.median(alone)
-    assert np.median(first) < 0.75 * np.median(first_alone)  # the first pair profits from all others
+    assert np.median(together) < 0.8 * np.median(without)
+    assert np.median(first) < 0.75 * np.median(first_without)  # the first pair profits from all others
     for values in (poses, near):
         assert np.mean(values) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / seeds))
 
@@ -116,7 +116,7 @@ def test_axis_does_not_repeat_what_edges_hold(tilt_rad: float) -> None:
     """Edges hold the commanded turn and that nothing climbs, and it may be which way the axis points: exactly so."""
     seeds = 30
     shared = CommonAxis(sigma_tilt_rad=tilt_rad, sigma_shift_m=0.0005, sigma_lift_m=np.inf)
-    alone, together, poses = np.zeros(seeds), np.zeros(seeds), np.zeros(seeds)
+    without, together, poses = np.zeros(seeds), np.zeros(seeds), np.zeros(seeds)
     for seed in range(seeds):
         rng = np.random.default_rng([9, seed])
         truth, camera_from_axis = _table(rng)
@@ -124,10 +124,10 @@ def test_axis_does_not_repeat_what_edges_hold(tilt_rad: float) -> None:
         graph = PoseGraph(tuple(held), first=0)
         plain, solution = solve(graph, {}), solve(graph, {}, axis=shared)
         assert solution.camera_from_axis is not None
-        alone[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
+        without[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
         k = 1 + seed % (COUNT - 1)
         poses[seed] = nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), truth[k])
-    assert np.median(together) < 0.95 * np.median(alone)
+    assert np.median(together) < 0.95 * np.median(without)
     assert np.mean(poses) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / seeds))
 
 
@@ -159,16 +159,16 @@ def test_axis_settles_what_each_pair_leaves_open() -> None:
 def test_table_on_which_things_are_pushed_about_still_has_one_normal() -> None:
     """Steps shift by centimetres, so that they share no axis's place; its direction settles the roll all the same."""
     pushed, seeds = CommonAxis(TABLE.sigma_tilt_rad, sigma_shift_m=0.03, sigma_lift_m=TABLE.sigma_lift_m), 20
-    values, alone, together = np.zeros(seeds), np.zeros(seeds), np.zeros(seeds)
+    values, without, together = np.zeros(seeds), np.zeros(seeds), np.zeros(seeds)
     for seed in range(seeds):
         rng = np.random.default_rng([5, seed])
         truth, _ = _table(rng, shift_m=0.03)
         graph = _graph(rng, truth, free_rad=np.radians(30.0))
         plain, solution = solve(graph, {}), solve(graph, {}, axis=pushed)
-        alone[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
+        without[seed], together[seed] = (rotation_error(s.trajectory, truth) for s in (plain, solution))
         k = 1 + seed % (COUNT - 1)
         values[seed] = nees(PoseGaussian(solution.trajectory[k], solution.covariances[k]), truth[k])
-    assert np.median(together) < 0.25 * np.median(alone)
+    assert np.median(together) < 0.25 * np.median(without)
     assert np.mean(values) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / seeds))
 
 

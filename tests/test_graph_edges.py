@@ -20,16 +20,7 @@ from modeler.closure.map_view import PathNetwork
 from modeler.export import RunFolder, RunMeta, edge_record, edges_of
 from modeler.graph import PoseGraph, Smoother, dead_reckoning, solve
 from modeler.priors import TurntablePrior
-from modeler.types import (
-    Array,
-    Edge,
-    EdgeKind,
-    Mode,
-    PoseGaussian,
-    Solution,
-    loop_closure_error,
-    loops_closed,
-)
+from modeler.types import Array, Edge, EdgeKind, Mode, PoseGaussian, Solution, loop_closure_error, loops_closed
 from modeler.types.solution import Chains
 from modeler.viz.report.run_data import Result
 
@@ -66,8 +57,8 @@ def test_the_chain_has_the_poses_of_the_solutions_odometry() -> None:
 
 def test_further_edges_leave_the_chain_as_it_is() -> None:
     graph = _graph(np.random.default_rng(1))
-    chain, alone = dead_reckoning(graph), dead_reckoning(PoseGraph(graph.edges[: COUNT - 1]))
-    for frame, pose in alone.items():
+    chain, opened = dead_reckoning(graph), dead_reckoning(PoseGraph(graph.edges[: COUNT - 1]))
+    for frame, pose in opened.items():
         np.testing.assert_array_equal(chain[frame].mean, pose.mean)
         np.testing.assert_array_equal(chain[frame].covariance, pose.covariance)
     solution = solve(PoseGraph(graph.edges[: COUNT - 1]), {})

@@ -180,15 +180,15 @@ def test_a_biased_distance_of_all_views_is_part_of_the_covariances() -> None:
 def test_a_biased_distance_of_all_views_does_not_speak_against_a_model() -> None:
     graph = _graph(np.random.default_rng(0), 0.0)
     shift = 0.1**2 * np.outer(OBJECT_M, OBJECT_M)
-    alone, shifted = solve(graph, {}), solve(graph, {}, common_shift_m2=shift)
+    plain, shifted = solve(graph, {}), solve(graph, {}, common_shift_m2=shift)
     seen = RayImage(Frame(0, 0.0, np.zeros((1, 1), np.float32), CAMERA), None, 0.0, 0.0, OBJECT_M[None], OBJECT_M[None],
                     np.zeros((1, 2), np.int64))  # fmt: skip
     spreads = [
         spread_of_positions(dict.fromkeys(TRUTH, seen), solution, AboutMean.of(solution), 0.005)
-        for solution in (alone, shifted)
+        for solution in (plain, shifted)
     ]
     assert spreads[1].check.value == pytest.approx(spreads[0].check.value, rel=1e-6)
-    assert np.trace(shifted.covariances[COUNT // 2][3:, 3:]) > 2.0 * np.trace(alone.covariances[COUNT // 2][3:, 3:])
+    assert np.trace(shifted.covariances[COUNT // 2][3:, 3:]) > 2.0 * np.trace(plain.covariances[COUNT // 2][3:, 3:])
 
 
 def test_errors_that_all_poses_share_are_none_of_the_model() -> None:
@@ -224,8 +224,8 @@ def test_errors_from_the_mean_of_all_poses_are_calibrated(share: float) -> None:
 
 
 def test_no_loop_tells_what_all_views_err_by() -> None:
-    alone, alike = (_graph(np.random.default_rng(2), 0.5, common) for common in (0.0, 4.0))
-    assert shared_noise(alike, solve(alike, {})) == pytest.approx(shared_noise(alone, solve(alone, {})), abs=0.01)
+    unlike, alike = (_graph(np.random.default_rng(2), 0.5, common) for common in (0.0, 4.0))
+    assert shared_noise(alike, solve(alike, {})) == pytest.approx(shared_noise(unlike, solve(unlike, {})), abs=0.01)
 
 
 def test_edges_taken_for_independent_are_too_sure() -> None:
@@ -247,12 +247,12 @@ def test_loops_tell_the_share(share: float) -> None:
 
 
 def test_one_edge_alone_keeps_its_covariance() -> None:
-    alone = edge(0, 1, PoseGaussian(se3.inverse(TRUTH[0]) @ TRUTH[1], WHOLE))
-    solution = solve(PoseGraph((alone,)), {}, shared=0.7)
+    single = edge(0, 1, PoseGaussian(se3.inverse(TRUTH[0]) @ TRUTH[1], WHOLE))
+    solution = solve(PoseGraph((single,)), {}, shared=0.7)
     np.testing.assert_allclose(solution.covariances[1], WHOLE, atol=1e-12)
     np.testing.assert_allclose(solution.relative_covariance(0, 1), WHOLE, atol=1e-12)
     apart = np.eye(6) - se3.adjoint(se3.inverse(TRUTH[1]) @ TRUTH[0])
-    alike = solve(PoseGraph((alone,)), {}, shared=0.7, common=0.5).covariances[1]
+    alike = solve(PoseGraph((single,)), {}, shared=0.7, common=0.5).covariances[1]
     np.testing.assert_allclose(alike, WHOLE + 0.5 * apart @ WHOLE @ apart.T, atol=1e-12)
 
 

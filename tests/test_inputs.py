@@ -16,15 +16,8 @@ from modeler import se3
 from modeler.cli import main
 from modeler.sequences import AbstractSequence, KeptSequence, bundled, frame_range, open_sequence, write_bop
 from modeler.types import Frame, InputError
-from studies.formats.image_folders import WRITERS, write_tum
+from studies.formats.image_folders import write_tum
 from studies.formats.ros_bags import Recorder
-
-
-@pytest.fixture(params=WRITERS)
-def folder(request: pytest.FixtureRequest, tmp_path: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> Path:
-    path = tmp_path / request.param
-    WRITERS[request.param](path, frames, truth)
-    return path
 
 
 def assert_same(sequence: AbstractSequence, frames: list[Frame], *, colour_off: float = 0.0) -> None:
@@ -107,9 +100,9 @@ def test_poses_are_not_interpolated_over_gaps(
     path = tmp_path / "s" / "groundtruth.txt"
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:3] + lines[4:]))  # without the pose after the first frame
-    known = open_sequence(tmp_path / "s").truth()
-    assert known is not None
-    assert tuple(known) == (1, 2, 3)
+    poses = open_sequence(tmp_path / "s").truth()
+    assert poses is not None
+    assert tuple(poses) == (1, 2, 3)
 
 
 def test_a_sequence_has_no_poses_to_convert(
@@ -203,11 +196,7 @@ def test_the_bundled_sequences_are_found_in_their_folder(capsys: pytest.CaptureF
 # Frames are selected by number, as slices are.
 
 
-@given(
-    every=st.integers(1, 4),
-    start=st.none() | st.integers(0, 14),
-    stop=st.none() | st.integers(0, 14),
-)
+@given(every=st.integers(1, 4), start=st.none() | st.integers(0, 14), stop=st.none() | st.integers(0, 14))
 def test_selection_is_a_slice_of_frame_numbers(every: int, start: int | None, stop: int | None) -> None:
     whole = Numbers(INDICES)
     wanted = [i for i in INDICES if i in range(0 if start is None else start, 99 if stop is None else stop)][::every]

@@ -12,14 +12,7 @@ from PIL import Image
 
 from modeler.sequences import Overrides, open_sequence, survey, write_bop
 from modeler.types import Frame, InputError
-from studies.formats.image_folders import WRITERS, save, write_open3d, write_tum
-
-
-@pytest.fixture(params=WRITERS)
-def folder(request: pytest.FixtureRequest, tmp_path: Path, frames: list[Frame], truth: dict[int, np.ndarray]) -> Path:
-    path = tmp_path / request.param
-    WRITERS[request.param](path, frames, truth)
-    return path
+from studies.formats.image_folders import save, write_open3d, write_tum
 
 
 def test_what_a_person_says_counts_more(folder: Path) -> None:

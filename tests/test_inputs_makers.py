@@ -94,9 +94,7 @@ def orbbec(shown: Shown) -> SimpleNamespace:
         ),
         Context=lambda: SimpleNamespace(
             query_devices=lambda: SimpleNamespace(
-                get_count=lambda: 1,
-                get_device_by_index=lambda place: device,
-                get_device_by_serial_number=by_serial,
+                get_count=lambda: 1, get_device_by_index=lambda place: device, get_device_by_serial_number=by_serial
             )
         ),
         Pipeline=lambda device: SimpleNamespace(
@@ -214,8 +212,8 @@ def test_frames_of_a_camera_are_read(maker: str, shown: Shown) -> None:
     assert sequence.live
     assert sequence.name in ("Orbbec Femto Bolt", "OAK-D-LITE", "Azure Kinect CL1")
     by_time_of_flight = 0.0 if maker == "oak" else MULTIPATH["tof"]
-    known = SensorNoise(sigma_r_m=None, sigma_focal=CALIBRATED_FOCAL, sigma_multipath=by_time_of_flight)
-    assert sequence.sensor() == known
+    noise = SensorNoise(sigma_r_m=None, sigma_focal=CALIBRATED_FOCAL, sigma_multipath=by_time_of_flight)
+    assert sequence.sensor() == noise
     read = list(itertools.islice(sequence, 14))
     assert [frame.index for frame in read] == list(range(14))
     assert (np.diff([frame.time_s for frame in read]) > 0.05).all()

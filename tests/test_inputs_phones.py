@@ -19,6 +19,7 @@ from modeler.export import RunFolder, RunMeta
 from modeler.sequences import Overrides, open_sequence, survey
 from modeler.types import Camera, Frame, InputError
 from studies.formats.image_folders import raw_depth, save
+from studies.formats.other_programs import write_camera
 
 
 def enlarged(camera: Camera, factor: float) -> dict[str, float]:
@@ -51,7 +52,8 @@ def confidence() -> np.ndarray:
     return trusted
 
 
-def larger(colour: np.ndarray, factor: int) -> np.ndarray:
+def larger(colour: np.ndarray | None, factor: int) -> np.ndarray:
+    assert colour is not None
     return colour.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
@@ -67,7 +69,6 @@ def test_recordings_of_record3d_are_read(tmp_path: Path, frames: list[Frame]) ->
             archive.writestr(f"rgbd/{frame.index}.depth", lzfse.compress(frame.depth_m.astype("<f4").tobytes()))
             archive.writestr(f"rgbd/{frame.index}.conf", lzfse.compress(confidence().tobytes()))
             packed = io.BytesIO()
-            assert frame.colour is not None
             Image.fromarray(larger(frame.colour, 6)).save(packed, "JPEG", quality=95)
             archive.writestr(f"rgbd/{frame.index}.jpg", packed.getvalue())
     check(tmp_path / "s.r3d", frames)
@@ -89,7 +90,6 @@ def test_folders_of_polycam_are_read(tmp_path: Path, frames: list[Frame]) -> Non
         stem, root = f"{41000000 + 500000 * frame.index}", tmp_path / "keyframes"
         save(root / "depth" / f"{stem}.png", raw_depth(frame, 1.0))
         save(root / "confidence" / f"{stem}.png", confidence() * 100)
-        assert frame.colour is not None
         save(root / "images" / f"{stem}.jpg", larger(frame.colour, 4))
         (root / "cameras").mkdir(exist_ok=True)
         facts = enlarged(frame.camera, 4.0) | {"width": 640, "height": 480, "t_00": 1.0}
@@ -103,7 +103,6 @@ def test_lists_of_nerfstudio_are_read(tmp_path: Path, frames: list[Frame]) -> No
         depth, image = f"depths/d{frame.index}.png", f"pictures/p{frame.index}.png"
         trusted = replace(frame, depth_m=np.where(confidence() > 0, frame.depth_m, np.float32(np.nan)))
         save(tmp_path / depth, raw_depth(trusted, 1.0))
-        assert frame.colour is not None
         save(tmp_path / image, larger(frame.colour, 3))
         listed.append({"file_path": image, "depth_file_path": depth, "transform_matrix": np.eye(4).tolist()})
     pixels = enlarged(frames[0].camera, 3.0)
@@ -118,8 +117,7 @@ def test_lists_of_nerfstudio_are_read(tmp_path: Path, frames: list[Frame]) -> No
 
 def test_exchanged_bytes_are_reported(tmp_path: Path, frames: list[Frame]) -> None:
     save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0).byteswap())
-    facts = {name: getattr(frames[0].camera, name) for name in ("fx", "fy", "cx", "cy")}
-    (tmp_path / "camera.json").write_text(json.dumps(facts))
+    write_camera(tmp_path, frames[0].camera)
     with pytest.raises(InputError, match="two bytes of its values exchanged"):
         open_sequence(tmp_path)
     save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
@@ -129,17 +127,13 @@ def test_exchanged_bytes_are_reported(tmp_path: Path, frames: list[Frame]) -> No
 def test_info_draws_what_it_read(tmp_path: Path, frames: list[Frame], cli: Run) -> None:
     for frame in frames:
         save(tmp_path / "s" / "depth" / f"{frame.index}.png", raw_depth(frame, 1.0))
-        assert frame.colour is not None
-        save(tmp_path / "s" / "rgb" / f"{frame.index}.png", frame.colour)
-    facts = {name: getattr(frames[0].camera, name) for name in ("fx", "fy", "cx", "cy")}
-    (tmp_path / "s" / "camera.json").write_text(json.dumps(facts))
+        save(tmp_path / "s" / "rgb" / f"{frame.index}.png", larger(frame.colour, 1))
+    write_camera(tmp_path / "s", frames[0].camera)
     assert cli("info", tmp_path / "s", "--picture", tmp_path / "look.png")[0] == 0
     with Image.open(tmp_path / "look.png") as drawn:
         pixels = np.asarray(drawn)
     assert pixels.shape == (2 * 124, 2 * 164, 3)
     first, second = frames[0].colour, frames[2].colour
-    assert first is not None
-    assert second is not None
     for row, colour in ((0, first), (124, second)):
         same = (pixels[row : row + 120, 164:324] == colour).all(axis=2)
         red = (pixels[row : row + 120, 164:324] == (255, 0, 0)).all(axis=2)
@@ -154,8 +148,7 @@ def test_names_that_are_angles_are_reported(
 ) -> None:
     for frame in frames:
         save(tmp_path / "depth" / f"{24 * frame.index}.png", raw_depth(frame, 1.0))
-    facts = {name: getattr(frames[0].camera, name) for name in ("fx", "fy", "cx", "cy")}
-    (tmp_path / "camera.json").write_text(json.dumps(facts))
+    write_camera(tmp_path, frames[0].camera)
     options = PriorOptions(prior="turntable", step_deg=step_deg)
     if refused:
         with pytest.raises(InputError, match=r"576° apart; if the names are angles, give --step-deg 1"):
@@ -174,11 +167,7 @@ def test_frames_that_are_new_changed_or_gone_are_named(tmp_path: Path) -> None:
 
     assert changes({0: "a", 1: "b", 2: "c"}) == ()
     assert changes({}) == ()  # of a sequence that is still being recorded
-    assert changes({0: "a", 1: "x", 3: "d", 4: "e"}) == (
-        "frames 3, 4 are new",
-        "frame 1 is changed",
-        "frame 2 is gone",
-    )
+    assert changes({0: "a", 1: "x", 3: "d", 4: "e"}) == ("frames 3, 4 are new", "frame 1 is changed", "frame 2 is gone")
     assert changes({index: "abc"[index] if index < 3 else "n" for index in range(20)}) == (
         "frames 3 to 19 (17) are new",
     )
@@ -190,8 +179,7 @@ def test_digests_are_of_content(frames: list[Frame], tmp_path: Path) -> None:
             units = raw_depth(frame, 1.0)
             units[60, 80] += shift if frame.index == 2 else 0
             save(folder / "depth" / f"{frame.index}.png", units)
-        facts = {name: getattr(frames[0].camera, name) for name in ("fx", "fy", "cx", "cy")}
-        (folder / "camera.json").write_text(json.dumps(facts))
+        write_camera(folder, frames[0].camera)
         return dict(survey(open_sequence(folder)).digests)
 
     first, again, other = digests(tmp_path / "a", 0), digests(tmp_path / "b", 0), digests(tmp_path / "c", 1)
@@ -218,7 +206,6 @@ def test_colour_of_a_video_belongs_to_depth_by_number(tmp_path: Path, frames: li
         track = container.add_stream("mpeg4", rate=30)
         track.width, track.height, track.pix_fmt, track.bit_rate = 320, 240, "yuv420p", 8_000_000
         for frame in frames[:-1]:
-            assert frame.colour is not None
             picture = av.VideoFrame.from_ndarray(larger(frame.colour, 2), format="rgb24")
             container.mux(track.encode(picture))
         container.mux(track.encode())

@@ -174,9 +174,9 @@ def test_onboarding_video_has_truth_for_its_first_frame_only(
 ) -> None:
     scene = tmp_path / "onboarding_dynamic" / "obj_000001"
     write_bop(scene, frames, {0: truth[0]}, depth_scale_mm=1.0)
-    known = open_sequence(scene).truth()
-    assert known is not None
-    assert tuple(known) == (0,)
+    poses = open_sequence(scene).truth()
+    assert poses is not None
+    assert tuple(poses) == (0,)
 
 
 def test_colour_without_depth_is_refused(tmp_path: Path, frames: list[Frame]) -> None:

@@ -154,9 +154,7 @@ def test_a_joined_model_has_what_each_run_hid(runs: Runs) -> None:
     assert under.sum() > 50  # only the lying run shows it
 
 
-def test_the_recording_shows_a_pair_of_views_that_joins_the_runs(
-    runs: Runs,
-) -> None:
+def test_the_recording_shows_a_pair_of_views_that_joins_the_runs(runs: Runs) -> None:
     report = json.loads((runs.joined / "report.json").read_bytes())
     overlaps = {
         (edge["source"], edge["target"]): edge["overlap"]

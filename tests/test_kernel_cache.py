@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from command_runner import spawned
 from slow_cases import quick_first
 
 from modeler import kernels
@@ -51,12 +50,9 @@ def called(toy: Path, **settings: str) -> list[str]:
     places = {"HOME": str(toy / "home"), "TMPDIR": str(toy / "temporary")}
     # Sources of equal times and sizes are equal to Python itself, where it has written bytecode.
     python = {"PYTHONPATH": str(toy), "PYTHONDONTWRITEBYTECODE": "1"}
-    environment = {**os.environ, **python, **places, **settings}
-    ended = subprocess.run(
-        [sys.executable, "-c", _CALL], env=environment, capture_output=True, text=True, check=False, timeout=100.0
-    )
-    assert (ended.returncode, ended.stderr) == (0, "")
-    return ended.stdout.split()
+    ended = spawned("-c", _CALL, settings=python | places | settings, timeout=100.0)
+    assert (ended.status, ended.err) == (0, "")
+    return ended.out.split()
 
 
 def files(toy: Path) -> list[Path]:

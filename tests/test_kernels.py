@@ -53,10 +53,7 @@ def random_ranges(rng):
 def test_paper_is_the_paper(noise, seed):
     rng = np.random.default_rng(seed)
     ranges_m, pose = random_ranges(rng), random_pose(rng)
-    for points, motion in (
-        (random_points(rng, 5), pose),
-        (random_points(rng, 5), se3.inverse(pose)),
-    ):
+    for points, motion in ((random_points(rng, 5), pose), (random_points(rng, 5), se3.inverse(pose))):
         want = sum(np.log(naive_kernels.paper_density(point, motion, ranges_m, INTRINSICS, noise)) for point in points)
         got = paper.log_likelihoods(rows(motion[None]), points, ranges_m, INTRINSICS, noise, np.array([np.inf, 0.0]))
         # The twin takes Q by differences, good to about 1e-10.
@@ -209,10 +206,7 @@ def test_the_class_of_a_point_follows_from_where_it_lies():
     assert classes.tolist() == [want for *_, want in cases]
 
 
-@pytest.mark.parametrize(
-    ("cosine", "want"),
-    [(1.0, -10.0), (0.2, -1.5), (0.0, -1.5), (-0.2, -1.5), (-1.0, -10.0)],
-)
+@pytest.mark.parametrize(("cosine", "want"), [(1.0, -10.0), (0.2, -1.5), (0.0, -1.5), (-0.2, -1.5), (-1.0, -10.0)])
 def test_steep_surface_that_a_camera_replaces_by_the_background_is_little_evidence(cosine, want):
     cells = np.zeros((*SHAPE, planes.CELL_SIZE), dtype=np.float32)
     cells[..., planes.DEPTH], cells[..., planes.KIND], cells[..., planes.SILHOUETTE] = 2.0, planes.BACKGROUND, 20.0

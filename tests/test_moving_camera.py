@@ -43,8 +43,8 @@ def test_a_view_holds_what_stands_beside_the_object(going_round):
         nothing = replace(found, mask=np.zeros_like(mask), outcome=Outcome.TOO_FEW_POINTS)
         assert (segmenter.with_surroundings(frame, nothing, scene).mask & mask).any()
         given = replace(frame, mask=mask)
-        alone = segmenter.segment(given, scene)
-        assert segmenter.with_surroundings(given, alone, scene) is alone
+        single = segmenter.segment(given, scene)
+        assert segmenter.with_surroundings(given, single, scene) is single
 
 
 def test_a_model_is_of_the_object_alone_and_stays_so_when_its_run_is_opened_again(going_round, tmp_path):

@@ -85,9 +85,8 @@ def test_points_behind_an_occluder_count_nothing(flashlight) -> None:  # noqa: F
         assert len(behind) > 20
         points = replace(replace(pair.forward, image=replace(hidden, plane=None)), points=pair.forward.points[behind])
         assert (points.classify(se3.rows(pose)) == UNKNOWN).all()
-        averted = replace(
-            points, points=np.array([[0.0, 0.0, -5.0, 0.0, 0.0, -1.0, 1e-6, 0.0, 0.0, 0.0]])
-        )  # counts 0, too
+        behind_camera = np.array([[0.0, 0.0, -5.0, 0.0, 0.0, -1.0, 1e-6, 0.0, 0.0, 0.0]])
+        averted = replace(points, points=behind_camera)  # counts 0, too
         one_way = replace(pair, forward=points, backward=averted)
         plain, explained, _ = one_way.scores(pose[None], 0.001, stride=1)
         assert plain[0] == 0.0
@@ -162,8 +161,8 @@ def test_a_frame_that_shows_only_an_arm_shows_no_object(rng) -> None:
 
 def test_a_hand_that_touches_the_object_is_no_part_of_it_where_it_is_marked(rng) -> None:
     seen, masks = filmed(6, rng, lambda k: standing(k).box((0.13, 0.0, 0.12), (0.1, 0.02, 0.02), label=2))
-    _, alone = filmed(6, rng, lambda k: World().box((0.13, 0.0, 0.12), (0.1, 0.02, 0.02), label=OBJECT))
-    hands = [hand & ~mask for hand, mask in zip(alone, masks, strict=True)]
+    _, bare = filmed(6, rng, lambda k: World().box((0.13, 0.0, 0.12), (0.1, 0.02, 0.02), label=OBJECT))
+    hands = [hand & ~mask for hand, mask in zip(bare, masks, strict=True)]
     frames = [replace(frame, occluder=hand) for frame, hand in zip(seen, hands, strict=True)]
     segmenter = Segmenter()
     scene = segmenter.scene(frames)

@@ -146,15 +146,7 @@ def test_evidence_is_all_of_the_density_or_what_is_known_without_the_guess(name:
         np.testing.assert_allclose(evidence, density)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "velocity",
-        "features",
-        "turntable that has learnt",
-        "velocity on a table",
-    ],
-)
+@pytest.mark.parametrize("name", ["velocity", "features", "turntable that has learnt", "velocity on a table"])
 def test_a_guess_carries_no_information(name: str) -> None:
     """Weighted by evidence over density, samples of a guess are samples of what is known without it."""
     samples = drawn(name)

@@ -216,10 +216,10 @@ def test_which_way_round_is_learnt(rng: np.random.Generator) -> None:
 def test_which_way_round_is_one_for_all_steps() -> None:
     """What three pairs tell weighs log(500) against a step the other way, and leaves it possible."""
     prior = TurntablePrior(24.0, 2.0, step_sign="unknown")
-    either, known = (p.between(SOURCE, TARGET) for p in (prior, replace(prior, sense=1)))
+    either, given = (p.between(SOURCE, TARGET) for p in (prior, replace(prior, sense=1)))
     right, wrong = truth(HERE)[None], se3.inverse(truth(HERE))[None]
-    assert known.log_prior(right) - either.log_prior(right) == pytest.approx(np.log(2.0 * (1.0 - UNDECIDED)), abs=1e-6)
-    assert known.log_prior(wrong) - either.log_prior(wrong) == pytest.approx(np.log(2.0 * UNDECIDED), abs=1e-6)
+    assert given.log_prior(right) - either.log_prior(right) == pytest.approx(np.log(2.0 * (1.0 - UNDECIDED)), abs=1e-6)
+    assert given.log_prior(wrong) - either.log_prior(wrong) == pytest.approx(np.log(2.0 * UNDECIDED), abs=1e-6)
 
 
 def sensed(taught: Sequence[Edge]) -> int:
@@ -450,8 +450,8 @@ def test_the_pace_of_the_last_two_frames_goes_on() -> None:
 
 def test_matching_shape_finds_the_motion() -> None:
     pose = truth(HERE)[None]
-    known = GeneralPrior().between(SOURCE, TARGET).log_density(pose)
-    assert FeaturesPrior().between(SOURCE, TARGET).log_density(pose) > known + 3.0
+    prior = GeneralPrior().between(SOURCE, TARGET).log_density(pose)
+    assert FeaturesPrior().between(SOURCE, TARGET).log_density(pose) > prior + 3.0
 
 
 def test_few_points_have_no_features() -> None:

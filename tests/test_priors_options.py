@@ -180,11 +180,7 @@ def test_pokes_are_read() -> None:
         (PriorOptions(prior="held"), TURNTABLE, "telling: has no robot.txt"),
         (PriorOptions(prior="poke"), TURNTABLE, "give them"),
         (PriorOptions(prior="poke", poke_length_m=0.1), None, "`poke_point_m` as well"),
-        (
-            PriorOptions(prior="table", step_deg=3.0),
-            None,
-            "`step_deg` is not a parameter of `prior` table",
-        ),
+        (PriorOptions(prior="table", step_deg=3.0), None, "`step_deg` is not a parameter of `prior` table"),
         (PriorOptions(prior="table+turntable", max_rotation_deg=3.0), TURNTABLE, "`max_rotation_deg`"),
         (PriorOptions(prior="turntable", step_deg=float("nan")), None, "`step_deg` nan is out of range"),
         (

@@ -53,8 +53,8 @@ def test_errors_that_averaging_removes_do_not_hide_smooth_ones() -> None:
     for frame in smooth:
         errors = np.random.default_rng([frame.index, 1]).normal(0.0, 1e-3, frame.depth_m.shape)  # as strong
         rough.append(replace(frame, depth_m=(1.0 / (1.0 / frame.depth_m + errors)).astype(np.float32)))
-    alone, both = (range_noise([(frame, MASK) for frame in frames]) for frames in (smooth, rough))
-    assert both.area_px == pytest.approx(alone.area_px, rel=0.15)
+    single, both = (range_noise([(frame, MASK) for frame in frames]) for frames in (smooth, rough))
+    assert both.area_px == pytest.approx(single.area_px, rel=0.15)
 
 
 def test_edges_and_the_object_do_not_count() -> None:
@@ -69,8 +69,8 @@ def test_edges_and_the_object_do_not_count() -> None:
 @pytest.mark.parametrize("nothing", [np.nan, 0.0])
 def test_without_surroundings_nothing_is_said(nothing: float) -> None:
     frame = plane_frame(1e-3, 0.0)
-    alone = np.where(MASK, frame.depth_m, np.float32(nothing)).astype(np.float32)
-    assert range_noise([(Frame(0, 0.0, alone, CAMERA, MASK), MASK)]) is None
+    single = np.where(MASK, frame.depth_m, np.float32(nothing)).astype(np.float32)
+    assert range_noise([(Frame(0, 0.0, single, CAMERA, MASK), MASK)]) is None
     assert range_noise([]) is None
 
 

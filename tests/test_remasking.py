@@ -44,13 +44,13 @@ def held(count, rng, *, wall, arm=0.03):
 @pytest.mark.parametrize("wall", [False, True])
 def test_by_the_poses_an_arm_is_left_out_and_the_object_stays(wall, rng):
     frames, both, masks, poses = held(8, rng, wall=wall)
-    alone, _, _, _ = held(8, rng, wall=wall, arm=0.0)
+    unheld, _, _, _ = held(8, rng, wall=wall, arm=0.0)
     sensor = Sensor()
     views = {k: sensor.ray_image(replace(frames[k], mask=both[k])) for k in poses}
     assert np.mean([iou(one, mask) for one, mask in zip(both, masks, strict=True)]) < 0.75
     found = moving_along(views, views, poses, TOLERANCE_M)
     assert np.mean([iou(found[k], masks[k]) for k in poses]) > 0.9
-    bare = {k: sensor.ray_image(replace(alone[k], mask=masks[k])) for k in poses}
+    bare = {k: sensor.ray_image(replace(unheld[k], mask=masks[k])) for k in poses}
     whole = moving_along(bare, bare, poses, TOLERANCE_M)
     assert min(iou(whole[k], masks[k]) for k in poses) > 0.97
     assert settled(whole, {k: np.asarray(view.frame.mask) for k, view in bare.items()})

@@ -16,17 +16,9 @@ import pytest
 from command_runner import Run
 from run_builders import META, made_up_steps
 
-from modeler.export import (
-    RunFolder,
-    RunMeta,
-    report_of,
-    write_atomically,
-)
+from modeler.export import RunFolder, RunMeta, report_of, write_atomically
 from modeler.system import concurrency
-from modeler.types import (
-    InputError,
-    Step,
-)
+from modeler.types import InputError, Step
 from modeler.verdict import judged
 from studies.fuzz.special import replace_by
 

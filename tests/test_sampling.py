@@ -59,8 +59,8 @@ def away(xi: Array) -> Array:
     return se3.moved(ABOUT, xi, CENTRE_M)
 
 
-def known(log_density: Callable[[Array], Array]) -> LogLikelihood:
-    """A log-likelihood of poses alone, under a focal length that is known."""
+def of_poses(log_density: Callable[[Array], Array]) -> LogLikelihood:
+    """A log-likelihood of poses alone, under a focal length that is certain."""
     return lambda poses, _: log_density(poses)
 
 
@@ -70,7 +70,7 @@ def test_samples_are_those_of_prior_times_likelihood(narrower: float) -> None:
     shift = narrower * SIGMAS * np.array([1.0, -1.0, 0.5, 0.5, -1.0, 1.0])
     images = gaussian(away(shift), narrower * SIGMAS)
     found = AdaptiveSampler(samples=6000).run(
-        Around(SIGMAS), known(images.log_density), CENTRE_M, np.random.default_rng(1)
+        Around(SIGMAS), of_poses(images.log_density), CENTRE_M, np.random.default_rng(1)
     )
     assert found.weights.sum() == pytest.approx(1.0)
     assert found.effective_samples > 3500.0
@@ -99,9 +99,9 @@ def test_two_modes_and_a_curved_ridge_keep_their_shares() -> None:
     shares, slopes = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        one = AdaptiveSampler(samples=2000).run(wide, known(heaps.log_density), CENTRE_M, rng)
+        one = AdaptiveSampler(samples=2000).run(wide, of_poses(heaps.log_density), CENTRE_M, rng)
         shares.append(one.weights[se3.difference(ABOUT, one.poses, CENTRE_M)[:, 0] > 0.0].sum())
-        other = AdaptiveSampler(samples=2000).run(wide, known(bent), CENTRE_M, rng)
+        other = AdaptiveSampler(samples=2000).run(wide, of_poses(bent), CENTRE_M, rng)
         xi = se3.difference(ABOUT, other.poses, CENTRE_M)
         slopes.append(other.weights @ (xi[:, 4] * xi[:, 0] ** 2) / (other.weights @ xi[:, 0] ** 4))
         assert min(one.effective_samples, other.effective_samples) > 500.0
@@ -113,7 +113,7 @@ def test_a_poor_proposal_costs_samples_and_not_correctness() -> None:
     """What only proposes is divided out: the result is the likelihood's own Gaussian."""
     images = gaussian(away(3.0 * SIGMAS), SIGMAS)
     found = AdaptiveSampler(samples=3000).run(
-        Around(SIGMAS, evidence=False), known(images.log_density), CENTRE_M, np.random.default_rng(3)
+        Around(SIGMAS, evidence=False), of_poses(images.log_density), CENTRE_M, np.random.default_rng(3)
     )
     mean, covariance = se3.mean(found.poses, found.weights, about_m=CENTRE_M)
     np.testing.assert_allclose(se3.difference(ABOUT, mean, CENTRE_M) / SIGMAS, 3.0, atol=0.1)
@@ -123,7 +123,7 @@ def test_a_poor_proposal_costs_samples_and_not_correctness() -> None:
 def test_it_draws_no_more_than_it_may_and_states_its_effective_size() -> None:
     narrow = gaussian(away(4.0 * SIGMAS), 0.01 * SIGMAS)
     found = AdaptiveSampler(draws=200, max_draws=400).run(
-        Around(SIGMAS), known(narrow.log_density), CENTRE_M, np.random.default_rng(0)
+        Around(SIGMAS), of_poses(narrow.log_density), CENTRE_M, np.random.default_rng(0)
     )
     assert len(found.poses) <= 400
     assert found.effective_samples < 100.0
@@ -138,7 +138,7 @@ def test_a_rough_likelihood_determines_its_mode_less_precisely(roughness_nats: f
         return images.log_density(poses) + roughness_nats * noise.normal(size=len(poses))
 
     found = AdaptiveSampler(max_draws=3000).run(
-        Around(SIGMAS, evidence=False), known(rough), CENTRE_M, np.random.default_rng(0)
+        Around(SIGMAS, evidence=False), of_poses(rough), CENTRE_M, np.random.default_rng(0)
     )
     assert (found.effective_samples >= 100.0) == usable
     if usable:
@@ -214,11 +214,11 @@ def test_modes_are_weighed_and_those_of_no_weight_dropped(rng):
 def mixture(rng):
     """Three Gaussians a few centimetres off the axes of motion, over a general prior."""
     centre_m = np.array([0.02, -0.05, 0.8])
-    known = GeneralDensity(centre_m, centre_m + 0.01, max_rotation_rad=0.9, max_offset_m=0.04)
+    prior = GeneralDensity(centre_m, centre_m + 0.01, max_rotation_rad=0.9, max_offset_m=0.04)
     means = se3.exp(rng.normal(size=(3, 6)) * np.repeat([0.3, 0.02], 3))
     spreads = np.linalg.cholesky(np.stack([np.cov(rng.normal(size=(6, 20))) for _ in range(3)]))
     spreads *= np.repeat([0.1, 0.005], 3)[:, None]
-    return MixtureProposal(known, GaussianMixture(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
+    return MixtureProposal(prior, GaussianMixture(means, spreads, np.log([0.5, 0.3, 0.2]), centre_m))
 
 
 def test_without_limits_the_volume_of_motions_without_overlap_does_not_outweigh_a_likelier_match() -> None:

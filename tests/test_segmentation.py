@@ -18,8 +18,6 @@ from modeler.segmentation.depth_images import (
     edge_of,
     mixed_pixels,
     noise_within,
-    pieces,
-    voxel_clusters,
     without_specks,
 )
 from modeler.sequences.bop import BopSequence
@@ -114,8 +112,8 @@ def test_an_arm_that_touches_the_object_now_and_then_is_not_part_of_it(rng, half
     """Where it is in front of the object, or most of what is there; if it is where the object may be, it is unsure."""
 
     def world(k):
-        alone = World().table().box((0.0, 0.0, half_m), (half_m, 0.03, half_m), turn_deg=25.0 * k, label=OBJECT)
-        return alone.box((0.25, arm_m, 0.06), (0.24, 0.025, 0.025)) if k in (2, 5) else alone
+        single = World().table().box((0.0, 0.0, half_m), (half_m, 0.03, half_m), turn_deg=25.0 * k, label=OBJECT)
+        return single.box((0.25, arm_m, 0.06), (0.24, 0.025, 0.025)) if k in (2, 5) else single
 
     frames, masks = filmed(8, rng, world)
     for k, (found, mask) in enumerate(zip(segmented(frames), masks, strict=True)):
@@ -176,11 +174,11 @@ def test_one_frame_is_enough_on_a_bare_table(rng):
     frames, masks = turned(3, rng)
     segmenter = Segmenter()
     for frame, mask in zip(frames, masks, strict=True):
-        alone = segmenter.segment(frame, segmenter.scene([frame]))
-        assert iou(alone.mask, mask) > 0.95
-        assert alone.outcome is Outcome.CONVERGED
+        single = segmenter.segment(frame, segmenter.scene([frame]))
+        assert iou(single.mask, mask) > 0.95
+        assert single.outcome is Outcome.CONVERGED
         unknown = segmenter.segment(frame, Scene())
-        np.testing.assert_array_equal(unknown.mask, alone.mask)
+        np.testing.assert_array_equal(unknown.mask, single.mask)
 
 
 def test_a_moving_camera_is_noticed(rng):
@@ -454,8 +452,8 @@ def test_hopeless_frames_have_an_outcome_and_no_exception(rng):
     segmenter = Segmenter()
     frames, _ = turned(3, rng)
     hopeless = [wall, nothing, zeros, noise, blind, odd]
-    for known in ([], [nothing], [nothing] * 3, [wall] * 3, [wall, nothing, noise], frames, [odd, *frames]):
-        scene = segmenter.scene(known)
+    for learned in ([], [nothing], [nothing] * 3, [wall] * 3, [wall, nothing, noise], frames, [odd, *frames]):
+        scene = segmenter.scene(learned)
         for frame in hopeless:
             one = segmenter.segment(frame, scene)
             assert one.mask.shape == frame.depth_m.shape
@@ -477,7 +475,7 @@ def test_bad_parameters_are_refused_in_one_line(fields):
         Segmenter(**fields)
 
 
-# What segmentation is made of: mixed pixels, pieces, clusters and edges.
+# What segmentation is made of: mixed pixels, specks and edges.
 
 
 def test_mixed_pixels_against_a_naive_twin(rng):
@@ -489,21 +487,6 @@ def test_mixed_pixels_against_a_naive_twin(rng):
             around = depth[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
             here = depth[row, column]
             assert fast[row, column] == (np.any(here - around > 0.05) and np.any(around - here > 0.05))
-
-
-def test_pieces_end_at_jumps_and_clusters_at_gaps():
-    depth = np.full((4, 9), 0.5, dtype=np.float32)
-    depth[:, 5:] = 0.6
-    labels = pieces(depth, np.ones(depth.shape, dtype=np.bool_))
-    assert set(np.unique(labels[:, :4])) == {labels[0, 0]}
-    assert labels[0, 0] != labels[0, 8]
-    line = np.full((75, 3), 0.01)
-    line[:, 0] = np.r_[np.linspace(0.0, 0.1, 50), np.linspace(0.15, 0.2, 25)]
-    near, far = (
-        voxel_clusters(line, low_m=np.zeros(3), high_m=np.full(3, 0.21), gap_m=gap_m) for gap_m in (0.06, 0.01)
-    )
-    assert len(np.unique(near)) == 1
-    assert len(np.unique(far)) == 2
 
 
 def test_specks_go():

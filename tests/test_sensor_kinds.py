@@ -122,7 +122,7 @@ def test_a_focal_length_is_known_as_well_as_where_it_comes_from(folder: Path) ->
 def test_a_recording_of_the_azure_kinect_is_calibrated_and_by_time_of_flight(tmp_path: Path) -> None:
     pytest.importorskip("av")
     write_mkv(tmp_path / "scan.mkv")
-    known = UNKNOWN._replace(sigma_focal=CALIBRATED_FOCAL, sigma_multipath=MULTIPATH["tof"])
-    assert open_sequence(tmp_path / "scan.mkv").sensor() == known
+    noise = UNKNOWN._replace(sigma_focal=CALIBRATED_FOCAL, sigma_multipath=MULTIPATH["tof"])
+    assert open_sequence(tmp_path / "scan.mkv").sensor() == noise
     typed = open_sequence(tmp_path / "scan.mkv", Overrides(intrinsics=(500.0, 500.0, 320.0, 288.0))).sensor()
-    assert typed == known._replace(sigma_focal=NOMINAL_FOCAL)
+    assert typed == noise._replace(sigma_focal=NOMINAL_FOCAL)

@@ -104,7 +104,7 @@ def test_each_symmetry_and_the_products_of_them_map_the_surface_onto_itself() ->
         assert np.mean(away_m > result.tolerance_m) < 0.01
         for other in result.discrete:
             product = one @ other
-            angles = [se3.rotation_angle(se3.inverse(product) @ known) for known in (np.eye(4), *result.discrete)]
+            angles = [se3.rotation_angle(se3.inverse(product) @ motion) for motion in (np.eye(4), *result.discrete)]
             assert min(angles) < np.radians(2.0)
 
 
@@ -186,8 +186,8 @@ def test_of_an_axis_that_colour_breaks_the_turns_that_it_leaves_are_found() -> N
 
 def test_cielab_has_white_black_and_primaries_where_they_are() -> None:
     srgb = np.array([[255.0, 255.0, 255.0], [0.0, 0.0, 0.0], [255.0, 0.0, 0.0], [0.0, 0.0, 255.0]])
-    known = [[100.0, 0.0, 0.0], [0.0, 0.0, 0.0], [53.24, 80.09, 67.20], [32.30, 79.19, -107.86]]
-    np.testing.assert_allclose(cielab(srgb), known, atol=0.1)
+    expected = [[100.0, 0.0, 0.0], [0.0, 0.0, 0.0], [53.24, 80.09, 67.20], [32.30, 79.19, -107.86]]
+    np.testing.assert_allclose(cielab(srgb), expected, atol=0.1)
 
 
 def test_bop_entries_hold_the_symmetries_in_the_frame_and_unit_of_the_model() -> None:

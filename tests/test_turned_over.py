@@ -76,14 +76,20 @@ RECIPE = Recipe(
 
 
 def edge(
-    source: int,
-    target: int,
-    kind: EdgeKind = "odometry",
-    pose: Array | None = None,
-    covariance: Array | None = None,
+    source: int, target: int, kind: EdgeKind = "odometry", pose: Array | None = None, covariance: Array | None = None
 ) -> Edge:
     gaussian = PoseGaussian(np.eye(4) if pose is None else pose, 1e-6 * np.eye(6) if covariance is None else covariance)
     return Edge(Posterior(source, target, gaussian, Outcome.CONVERGED, overlap=0.8), kind, True, Stated("made up"))
+
+
+def brick_views(poses: list[Array]) -> dict[int, RayImage]:
+    sensor = Sensor(SensorNoise(1e-3, 1e-3))
+    return {k: sensor.ray_image(view.frame) for k, view in tabletop.views(tabletop.BRICK, poses).items()}
+
+
+def shifted(views: dict[int, RayImage], by: int) -> dict[int, RayImage]:
+    """Return views as if their frames had higher numbers."""
+    return {k + by: replace(view, frame=replace(view.frame, index=k + by)) for k, view in views.items()}
 
 
 def test_a_recipe_puts_the_object_down_otherwise_and_it_stands_on_the_table() -> None:
@@ -118,14 +124,12 @@ def test_both_postures_make_one_model_and_the_table_ties_neither_to_the_other() 
 
 def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
     poses = tabletop.turntable(6)
-    sensor = Sensor(SensorNoise(1e-3, 1e-3))
-    views = {k: sensor.ray_image(view.frame) for k, view in tabletop.views(tabletop.BRICK, poses).items()}
-    moved = {k + 6: shifted(view, k + 6) for k, view in views.items()}
+    views = brick_views(poses)
     one, other = tabletop.trajectory(poses), {k + 6: pose for k, pose in tabletop.trajectory(poses).items()}
     halfway = se3.exp(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0]))
     quarter = se3.exp(np.array([0.0, 0.0, 0.5 * np.pi, 0.0, 0.0, 0.0]))
     ways = [Alignment(pose) for pose in (quarter, np.eye(4), halfway)]
-    parts = Segment(views, Solution(one), ()), Segment(moved, Solution(other), ())
+    parts = Segment(views, Solution(one), ()), Segment(shifted(views, 6), Solution(other), ())
     found = Joiner().weighted(*parts, ways)
     assert [Joiner().is_consistent(*parts, way) for way in found] == [True, True, False]
     assert 0.05 < found[0].share < 0.95
@@ -141,12 +145,10 @@ def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
 def test_a_right_alignment_does_not_pay_for_poses_that_err_within_segments(bend: float) -> None:
     """Pairs that share surface pay for them; an alignment that shares less must not be the likelier for it."""
     poses = tabletop.turntable(6)
-    sensor = Sensor(SensorNoise(1e-3, 1e-3))
-    views = {k: sensor.ray_image(view.frame) for k, view in tabletop.views(tabletop.BRICK, poses).items()}
-    moved = {k + 6: shifted(view, k + 6) for k, view in views.items()}
+    views = brick_views(poses)
     true = tabletop.trajectory(poses)
     bent = {k: true[0] @ se3.exp(bend * se3.log(se3.inverse(true[0]) @ pose)) for k, pose in true.items()}
-    parts = Segment(views, Solution(bent), ()), Segment(moved, Solution({k + 6: bent[k] for k in bent}), ())
+    parts = Segment(views, Solution(bent), ()), Segment(shifted(views, 6), Solution({k + 6: bent[k] for k in bent}), ())
     assert Joiner().likelihoods(*parts, [Alignment(np.eye(4))])[0] > 0.0
 
 
@@ -172,7 +174,7 @@ def test_sessions_that_share_few_views_are_held_against_pairs_that_share_as_litt
     views, true = printed_views(poses), tabletop.trajectory(poses)
     parts = (
         Segment({k: views[k] for k in first}, Solution({k: true[k] for k in first}), ()),
-        Segment({k + 16: shifted(views[k], k + 16) for k in last}, Solution({k + 16: true[k] for k in last}), ()),
+        Segment(shifted({k: views[k] for k in last}, 16), Solution({k + 16: true[k] for k in last}), ()),
     )
     turns = [np.zeros(6), *np.pi * np.eye(6)[[0, 2]]]  # a brick fits its hull upside down and the other way round
     found = [Joiner().is_consistent(*parts, Alignment(se3.exp(turn))) for turn in turns]
@@ -195,7 +197,7 @@ def test_sessions_that_are_bent_are_compared_as_they_are_once_joined() -> None:
             covariance = adjoint @ about_body @ adjoint.T
             steps.append(edge(k + 1 + offset, k + offset, "odometry", se3.inverse(bent[k]) @ bent[k + 1], covariance))
         placed = Solution({k + offset: bent[k] for k in frames})
-        bent_parts.append(Segment({k + offset: shifted(views[k], k + offset) for k in frames}, placed, tuple(steps)))
+        bent_parts.append(Segment(shifted({k: views[k] for k in frames}, offset), placed, tuple(steps)))
     parts = bent_parts[0], bent_parts[1]
     joiner = Joiner(pairs=4)
     ways = [joiner._registered(*parts, se3.exp(turn)) for turn in [np.pi * np.eye(6)[0], np.zeros(6)]]
@@ -216,10 +218,6 @@ def test_a_rotation_that_the_alignment_alone_bounds_joins_nothing(sigma_deg: flo
     judged = Joiner()._judged(found, (view, view), np.eye(4))
     assert judged.accepted is accepted
     assert isinstance(judged.reason, OpenRotation) is not accepted
-
-
-def shifted(view: RayImage, index: int) -> RayImage:
-    return replace(view, frame=replace(view.frame, index=index))
 
 
 def test_segments_are_what_hangs_together_without_joins() -> None:

@@ -52,13 +52,7 @@ from modeler.verdict.evidence import (
     prior_check,
     prior_distances,
 )
-from modeler.verdict.spreads import (
-    AboutMean,
-    misfit,
-    one_axis_sd,
-    spread_of_positions,
-    spread_of_rotations,
-)
+from modeler.verdict.spreads import AboutMean, misfit, one_axis_sd, spread_of_positions, spread_of_rotations
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 AXES_M = np.array([0.09, 0.05, 0.03])
@@ -75,11 +69,7 @@ def turned(angle_deg: float) -> Array:
 
 
 def seen(
-    index: int,
-    camera_from_object: Array,
-    wall_m: float = 1.0,
-    plane: Plane | None = None,
-    axes_m: Array = AXES_M,
+    index: int, camera_from_object: Array, wall_m: float = 1.0, plane: Plane | None = None, axes_m: Array = AXES_M
 ) -> RayImage:
     """An ellipsoid before a wall, each pixel a ray that meets it or does not."""
     w, h = CAMERA.rays()
@@ -427,8 +417,8 @@ def whole_run(
     frames = [FrameRecord(k, float(k), 100, "accepted", mask=mask.label) for k, mask in enumerate(masks)]
     solution = solve(PoseGraph(edges=edges, first=0), {}, focal=focal)
     step = last_step(views, edges, frames, solution=solution, last=last, make_model=ball)
-    known = {"prior": prior, "closure_expected": expected, "depth_scale_sigma": depth_scale_sigma}
-    verdict = judged(step, **known, tolerance_m=0.005)
+    given = {"prior": prior, "closure_expected": expected, "depth_scale_sigma": depth_scale_sigma}
+    verdict = judged(step, **given, tolerance_m=0.005)
     assert verdict.trustworthy == (not verdict.reasons)
     return list(verdict.codes), {name: check.holds for name, check in verdict.checks.items()}
 

@@ -80,7 +80,7 @@ def test_a_bent_turn_is_as_far_off_as_stated(rng: np.random.Generator) -> None:
     def apart(target: int, source: int) -> np.ndarray:
         return spread if (target < half) != (source < half) else np.zeros((6, 6))
 
-    squares, alone = [], []
+    squares, single = [], []
     for axis in np.eye(3):  # as far apart along each as the mean square of shifts drawn at random
         shifts_m = np.sqrt(1.5) * sigma_m * np.array([axis, -axis])
         bent = {
@@ -93,8 +93,8 @@ def test_a_bent_turn_is_as_far_off_as_stated(rng: np.random.Generator) -> None:
         assert model.vertex_sigmas_m is not None
         off_m = BALL.distance(model.vertices_m)
         squares.append((off_m / wide.vertex_sigmas_m) ** 2)
-        alone.append((off_m / model.vertex_sigmas_m) ** 2)
+        single.append((off_m / model.vertex_sigmas_m) ** 2)
     squares = np.concatenate(squares)
     assert 0.5 < squares.mean() < 1.3
     assert np.mean(squares < 1.96**2) > 0.93
-    assert np.concatenate(alone).mean() > 1.5 * squares.mean()
+    assert np.concatenate(single).mean() > 1.5 * squares.mean()

@@ -36,11 +36,7 @@ CAPTIONS = (
     entities.PAIR_CAPTION,
     entities.VISIBILITY_CAPTION,
 )
-SPREADS = (
-    entities.POSITION_1_SIGMA,
-    entities.POSITION_3_SIGMA,
-    entities.BEFORE_POSITION_3_SIGMA,
-)
+SPREADS = (entities.POSITION_1_SIGMA, entities.POSITION_3_SIGMA, entities.BEFORE_POSITION_3_SIGMA)
 EDGES = (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
 
 
@@ -55,12 +51,8 @@ def test_every_promised_entity_is_recorded(recording: Recording) -> None:
         "positions": [*PAIR_CLOUDS, entities.PAIR_DRAWS, entities.CLOUD, *GHOSTS, entities.VISIBILITY_AGREES, *MERGED],
         "vertex_positions": [entities.MESH],
         "strips": [
-            entities.CAMERAS,
-            entities.CURRENT,
-            entities.CHAIN,
+            *(entities.CAMERAS, entities.CURRENT, entities.CHAIN, entities.OUTLINE, entities.DEPTH_OUTLINE),
             *EDGES,
-            entities.OUTLINE,
-            entities.DEPTH_OUTLINE,
         ],
         "vectors": [entities.AXES, entities.PAIR_AXES],
         "half_sizes": [*SPREADS, entities.EDGES_1_SIGMA, entities.GHOST_CENTRE_1_SIGMA, entities.GHOST_CENTRE_3_SIGMA],
@@ -94,9 +86,8 @@ def test_what_a_frame_tried_again_brings_stands_at_the_latest_frame(run: list[St
     again = replace(last, frame=run[LOST].frame, view=run[LOST].view)
     recording = record(tmp_path / "r.rrd", [*run[:-1], again, last])
     assert f"Frame {LOST}: left out" in recording[entities.NOW][LOST]["text"][0]
-    assert len(drawn(recording, entities.CLOUD, "positions")[LOST]) < len(
-        drawn(recording, entities.CLOUD, "positions")[4]
-    )
+    points = drawn(recording, entities.CLOUD, "positions")
+    assert len(points[LOST]) < len(points[4])
 
 
 def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> None:
@@ -203,14 +194,9 @@ def odd_steps(run: list[Step]) -> list[Step]:
     step = run[1]
     nothing = Segmentation(np.zeros_like(step.segmentation.mask), None, Outcome.TOO_FEW_POINTS)
     blind = replace(step.frame, depth_m=np.full_like(step.frame.depth_m, np.nan))
+    none = np.zeros((0, 3))
     assert step.model is not None
-    empty = replace(
-        step.model,
-        points_m=np.zeros((0, 3)),
-        normals=np.zeros((0, 3)),
-        colours=None,
-        triangles=np.zeros((0, 3), dtype=np.int64),
-    )
+    empty = replace(step.model, points_m=none, normals=none, colours=None, triangles=none.astype(np.int64))
     unknown = Solution(step.solution.trajectory, {1: np.full((6, 6), np.nan)}, {})
     posterior = step.posteriors[0]
     lost = replace(posterior, pose=PoseGaussian(posterior.pose.mean, np.full((6, 6), np.inf)))
@@ -262,19 +248,12 @@ def test_the_camera_stands_where_its_pose_says(run: list[Step], recording: Recor
 
 def test_edges_are_distinguished(run: list[Step], recording: Recording) -> None:
     last = run[-1]
-    for path, kind, accepted in (
-        (entities.ODOMETRY, "odometry", True),
-        (entities.CLOSURE, "closure", True),
-        (entities.REJECTED, "closure", False),
-    ):
+    for path, kind, accepted in zip(EDGES, ("odometry", "closure", "closure"), (True, True, False), strict=True):
         wanted = [edge for edge in last.edges_so_far if edge.kind == kind and edge.accepted == accepted]
         row = recording[path][COUNT - 1]
         ends = [[last.solution.trajectory[k][:3, 3] for k in (edge.target, edge.source)] for edge in wanted]
         np.testing.assert_allclose(np.array(row["strips"]), np.array(ends), atol=1e-6)
-    colours = {
-        tuple(recording[p][COUNT - 1]["colors"]) for p in (entities.ODOMETRY, entities.CLOSURE, entities.REJECTED)
-    }
-    assert len(colours) == 3
+    assert len({tuple(recording[path][COUNT - 1]["colors"]) for path in EDGES}) == 3
 
 
 def test_an_edge_that_the_optimisation_left_out_counts_as_rejected(run: list[Step], tmp_path: Path) -> None:
@@ -406,12 +385,8 @@ def test_a_coarsened_mesh_keeps_its_shape() -> None:
     u, v = np.meshgrid(np.linspace(0, 1, count), np.linspace(0, 1, count), indexing="ij")
     vertices = np.stack([u, v, 0.1 * np.sin(3 * u), u + v], axis=-1).reshape(-1, 4)
     corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).reshape(-1)
-    triangles = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + count], 1),
-            np.stack([corner + 1, corner + count + 1, corner + count], 1),
-        ]
-    )
+    places = np.array([[0, 1, count], [1, count + 1, count]])
+    triangles = (corner[:, None, None] + places).reshape(-1, 3)
     coarse, kept = model_view.coarsened(vertices, triangles, 5_000)
     assert 500 < len(kept) <= 5_000
     np.testing.assert_allclose(coarse[:, 2], 0.1 * np.sin(3 * coarse[:, 0]), atol=1e-3)

@@ -15,12 +15,15 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote
 
 import pytest
+from command_runner import spawned
 from rerun_recordings import read, record
 from slow_cases import quick_first
 from turning_box import COUNT
@@ -76,9 +79,8 @@ def listeners(process: subprocess.Popen[bytes]) -> set[str]:
 def test_the_page_is_served_on_this_machine_alone(run: list[Step], tmp_path: Path) -> None:
     stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     stream(run[0])
-    assert stream.address is not None
     assert stream.address.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(stream.address, timeout=5.0) as page:
+    with urllib.request.urlopen(str(stream.address), timeout=5.0) as page:
         assert b"<html" in page.read()
     (server,) = stream.viewers
     assert listeners(server.process) == {"0100007F"}
@@ -99,16 +101,24 @@ def test_a_viewer_lasts_beyond_the_thread_that_starts_it() -> None:
     assert served[0].process.poll() is not None
 
 
-def test_a_viewer_that_dies_does_not_stop_the_run(
-    run: list[Step], tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("number", "says"), [(signal.SIGKILL, "the viewer was closed"), (signal.SIGSTOP, "")])
+def test_a_viewer_that_dies_or_freezes_does_not_stop_the_run(
+    run: list[Step],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    says: str,
 ) -> None:
+    monkeypatch.setattr("modeler.viz.stream._PATIENCE_S", 0.5)
+    monkeypatch.setattr("modeler.viz.viewer.STOP_S", 0.2)
     stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
     stream(run[0])
-    stream.viewers[0].stop()
+    stream.viewers[0].process.send_signal(number)
     for step in run[1:]:
         stream(step)
     stream.close()
-    assert "the viewer was closed" in caplog.text
+    assert says in caplog.text
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
 
 
@@ -119,20 +129,6 @@ def test_a_viewer_that_is_already_open_may_be_closed_while_the_run_goes_on(run: 
     stream(run[0])
     assert served.process.poll() is None
     served.stop()
-    for step in run[1:]:
-        stream(step)
-    stream.close()
-    assert set(read(tmp_path / "r.rrd")[entities.NOW]) == set(range(COUNT))
-
-
-def test_a_viewer_that_freezes_does_not_stop_the_run(
-    run: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("modeler.viz.stream._PATIENCE_S", 0.5)
-    monkeypatch.setattr("modeler.viz.viewer.STOP_S", 0.2)
-    stream = open_stream("box", save=tmp_path / "r.rrd", web=True)
-    stream(run[0])
-    stream.viewers[0].process.send_signal(signal.SIGSTOP)
     for step in run[1:]:
         stream(step)
     stream.close()
@@ -163,11 +159,10 @@ with endable():
 
 def streamed(path: Path, *options: str, status: int = 0) -> str:
     """Stream a run to a file in a process of its own, and return what that says."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    arguments = [sys.executable, "-c", _STREAM, str(path), *options]
-    ended = subprocess.run(arguments, stderr=subprocess.PIPE, text=True, timeout=60.0, check=False, env=environment)
-    assert ended.returncode == status, ended.stderr
-    return ended.stderr
+    settings = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    ended = spawned("-c", _STREAM, path, *options, settings=settings, timeout=60.0)
+    assert ended.status == status, ended.err
+    return ended.err
 
 
 @pytest.mark.parametrize("short", quick_first([0.99, 0.9, 0.5]))
@@ -348,6 +343,15 @@ def test_a_recording_is_served_to_this_machine_alone_and_quietly(
     assert capfd.readouterr() == ("", "")
 
 
+@contextmanager
+def command(program: str, path: Path) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Run a program of Python in a process of its own; yield that and the number of the server's, which it prints."""
+    arguments = [sys.executable, "-c", program, str(path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, env=environment) as process:
+        yield process, int(process.stdout.readline())
+
+
 @pytest.mark.parametrize("number", quick_first([signal.SIGINT, signal.SIGTERM]))
 def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp_path: Path, number: int) -> None:
     record(tmp_path / "recording.rrd", run[:1])
@@ -357,11 +361,10 @@ def test_the_server_ends_with_the_command_that_waits_for_it(run: list[Step], tmp
         "served = viewer.view(pathlib.Path(sys.argv[1]), web=True);"
         "print(served.process.pid, flush=True); served.wait()"
     )
-    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
-        server = int(command.stdout.readline())
+    with command(program, tmp_path) as (process, server):
         time.sleep(0.2)  # from the line to the wait
-        command.send_signal(number)
-        assert command.wait(timeout=10.0) == 0
+        process.send_signal(number)
+        assert process.wait(timeout=10.0) == 0
     with pytest.raises(ProcessLookupError):
         os.kill(server, 0)
 
@@ -373,10 +376,9 @@ def test_the_server_ends_with_its_parent_however_that_ends(run: list[Step], tmp_
         "import sys, pathlib, time; from modeler.viz import viewer;"
         "print(viewer.view(pathlib.Path(sys.argv[1]), web=True).process.pid, flush=True); time.sleep(60)"
     )
-    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as command:
-        server = int(command.stdout.readline())
+    with command(program, tmp_path) as (process, server):
         assert b"rerun" in Path(f"/proc/{server}/cmdline").read_bytes()
-        command.kill()
+        process.kill()
     deadline = time.monotonic() + 10.0
     while running(server):
         assert time.monotonic() < deadline
@@ -426,22 +428,17 @@ def test_a_run_that_is_terminated_leaves_a_whole_recording_and_no_server(tmp_pat
         "    finally:\n"
         "        stream.close()\n"
     )
-    arguments = [sys.executable, "-c", program, str(tmp_path / "r.rrd")]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, env=environment) as command:
-        server = int(command.stdout.readline())
-        command.terminate()
-        assert command.wait(timeout=20.0) == 128 + signal.SIGTERM
+    with command(program, tmp_path / "r.rrd") as (process, server):
+        process.terminate()
+        assert process.wait(timeout=20.0) == 128 + signal.SIGTERM
     with pytest.raises(ProcessLookupError):
         os.kill(server, 0)
     assert set(read(tmp_path / "r.rrd")[entities.NOW]) == {0}
 
 
 def test_rerun_is_not_imported_before_it_is_needed() -> None:
-    program = (
-        "import sys, modeler.viz.stream, modeler.viz.viewer, modeler.viz.entities; sys.exit('rerun' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+    program = "import sys; from modeler.viz import entities, stream, viewer; sys.exit('rerun' in sys.modules)"
+    assert spawned("-c", program).status == 0
 
 
 @pytest.mark.slow
