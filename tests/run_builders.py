@@ -41,18 +41,16 @@ def ball(*, coloured: bool = True) -> ObjectModel:
                        np.asarray(ball.faces, dtype=np.int64), normals, colours)  # fmt: skip
 
 
+def model_of(mesh: trimesh.Trimesh) -> ObjectModel:
+    """A mesh as the surface of a model, without colours and points of views."""
+    none = np.zeros((0, 3))
+    vertices_m, normals = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.vertex_normals, np.float64)
+    return ObjectModel(none, none, None, vertices_m, np.asarray(mesh.faces, np.int64), normals, None)
+
+
 def block(sides_m: tuple[float, float, float], pose: Array) -> ObjectModel:
     """A solid box about the origin of a frame, given by its pose (4, 4)."""
-    box = trimesh.creation.box(sides_m)
-    return ObjectModel(
-        points_m=np.zeros((0, 3)),
-        normals=np.zeros((0, 3)),
-        colours=None,
-        vertices_m=se3.transform(pose, np.asarray(box.vertices)),
-        triangles=np.asarray(box.faces, dtype=np.int64),
-        vertex_normals=np.asarray(box.vertex_normals) @ pose[:3, :3].T,
-        vertex_colours=None,
-    )
+    return model_of(trimesh.creation.box(sides_m, pose))
 
 
 def an_edge(target: int, source: int, rng: np.random.Generator, kind: EdgeKind = "odometry", **changes: Any) -> Edge:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from modeler import se3
 from modeler.types import Array, Camera, Frame, RayImage
@@ -119,6 +121,14 @@ def seen(frame: Frame, normals: Array, sigma_r_m: float) -> RayImage:
     depth = frame.depth_m[frame.mask].astype(np.float64)
     points = np.stack([w[frame.mask] * depth, h[frame.mask] * depth, depth], axis=1)
     return RayImage(frame, None, 1e-3, sigma_r_m, points, normals, pixels)
+
+
+def recoloured(view: RayImage, colour: npt.NDArray[Any] | None) -> RayImage:
+    """Return a view with other colours: numbers (h, w, 3) that are rounded, grey levels (h, w), or none."""
+    if colour is not None:
+        three = colour if colour.ndim == 3 else np.repeat(colour[..., None], 3, axis=2)
+        colour = np.rint(three).astype(np.uint8)
+    return replace(view, frame=replace(view.frame, colour=colour))
 
 
 def views(body: Body, poses: list[Array], rng: np.random.Generator | None = None) -> dict[int, RayImage]:

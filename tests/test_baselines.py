@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
@@ -232,7 +232,7 @@ def printed_ball(turn_deg: float, seed: int) -> RayImage:
     grey = 128.0 + 90.0 * np.sin(90.0 * on_ball[:, 0]) * np.cos(70.0 * on_ball[:, 1] + 40.0 * on_ball[:, 2])
     colour = seen.frame.colour.copy()
     colour[seen.pixels[:, 0], seen.pixels[:, 1]] = np.rint(grey)[:, None]
-    return replace(seen, frame=replace(seen.frame, colour=colour))
+    return tabletop.recoloured(seen, colour)
 
 
 def test_coloured_icp_sees_a_printed_ball_turn(rng: np.random.Generator) -> None:

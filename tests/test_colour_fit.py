@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from scipy import ndimage
 from slow_cases import quick_first
+from tabletop import recoloured
 from test_inputs_plain_errors import colour_as
 from test_verdict import CAMERA, MIDDLE, poses_of, seen, turned, views_of, whole_run
 
@@ -46,21 +46,14 @@ def printed(
             np.sin(points_m @ waves.T + phases), axis=1
         )
         image += noise * rng.normal(size=image.shape)
-        grey = np.clip(image, 0, 255).astype(np.uint8)
-        colour = np.ascontiguousarray(np.broadcast_to(grey[..., None], (*grey.shape, 3)))
-        views[index] = replace(view, frame=replace(view.frame, colour=colour))
+        views[index] = recoloured(view, np.clip(image, 0, 255))
     return views
 
 
 def changed(views: dict[int, RayImage], **how: object) -> dict[int, RayImage]:
     """Return views with colour as another camera shows it."""
     given = {"mirrored": False, "scale": 1.0, "shift_px": (0.0, 0.0)} | how
-    found = {}
-    for index, view in views.items():
-        assert view.frame.colour is not None
-        colour = np.ascontiguousarray(colour_as(view.frame.colour, **given))  # pyright: ignore[reportArgumentType]
-        found[index] = replace(view, frame=replace(view.frame, colour=colour))
-    return found
+    return {k: recoloured(view, colour_as(view.frame.colour, **given)) for k, view in views.items()}  # pyright: ignore[reportArgumentType]
 
 
 def test_aligned_colour_fits() -> None:
@@ -97,19 +90,15 @@ def test_displaced_colour_is_found(
 def test_colour_that_is_turned_over_is_found(flip: Flip) -> None:
     views, poses = printed(above_deg=35.0), [from_above(angle_deg, 35.0) for angle_deg in ANGLES_DEG]
     across, down = map(int, FLIPS[flip])
-    for index, view in views.items():
-        colour = np.ascontiguousarray(view.frame.colour[::down, ::across])
-        views = views | {index: replace(view, frame=replace(view.frame, colour=colour))}
-    fit = colour_fit(views, {index: se3.inverse(pose) for index, pose in enumerate(poses)})
+    turned_over = {k: recoloured(view, view.frame.colour[::down, ::across]) for k, view in views.items()}
+    fit = colour_fit(turned_over, {index: se3.inverse(pose) for index, pose in enumerate(poses)})
     assert not fit.check.holds
     assert str(fit.displacement) == f"is {flip}"
 
 
 def test_colour_of_the_frame_before_is_found() -> None:
     views = printed()
-    late = {
-        k: replace(views[k], frame=replace(views[k].frame, colour=views[max(k - 1, 0)].frame.colour)) for k in views
-    }
+    late = {k: recoloured(view, views[max(k - 1, 0)].frame.colour) for k, view in views.items()}
     fit = colour_fit(late, poses_of(ANGLES_DEG))
     assert not fit.check.holds
     assert str(fit.displacement) == "is of the frame before"
@@ -129,8 +118,7 @@ def test_a_pattern_that_stands_still_is_not_taken_for_print() -> None:
     for index, angle_deg in enumerate(angles_deg):
         view = seen(index, turned(angle_deg), axes_m=np.full(3, 0.03))
         image = np.where(np.asarray(view.frame.mask), 120.0, wall) + 4.0 * rng.normal(size=wall.shape)
-        grey = np.clip(image, 0, 255).astype(np.uint8)
-        views[index] = replace(view, frame=replace(view.frame, colour=np.stack([grey] * 3, axis=-1)))
+        views[index] = recoloured(view, np.clip(image, 0, 255))
     fit = colour_fit(views, poses_of(angles_deg))
     assert fit.check.holds
 

@@ -10,7 +10,7 @@ import pytest
 import tabletop
 import trimesh
 from scipy.spatial import KDTree
-from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
+from tabletop import BALL, BRICK, PLATE, POSES, edge_uses, recoloured
 
 from modeler import se3
 from modeler.fusion import Fuser, meshing
@@ -56,10 +56,6 @@ def on_top(points_m: Array) -> BoolArray:
 
 def colours_of(view: RayImage) -> Array:
     return view.frame.colour.astype(np.float64)
-
-
-def recoloured(view: RayImage, colour: Array | None) -> RayImage:
-    return replace(view, frame=replace(view.frame, colour=None if colour is None else np.rint(colour).astype(np.uint8)))
 
 
 # The zero level.

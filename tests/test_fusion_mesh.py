@@ -7,12 +7,13 @@ import numpy.typing as npt
 import pytest
 import tabletop
 import trimesh
+from run_builders import model_of
 from tabletop import BALL, BRICK, PLATE, POSES, edge_uses
 
 from modeler import se3
 from modeler.export.mesh import PIECE, textured
 from modeler.fusion import Fuser, FusionVolume, meshing, watertight
-from modeler.types import Array, ObjectModel, Plane
+from modeler.types import Array, Plane
 
 VOXEL_M = 0.0025
 FUSER = Fuser(voxel_m=VOXEL_M)
@@ -146,16 +147,18 @@ def test_only_vertices_asked_for_are_smoothed_and_nothing_shrinks(rng: np.random
 CUBE = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().subdivide().subdivide().subdivide().subdivide()
 
 
-def bumpy_cube(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return the cube's vertices off by bumps several triangles wide, and the distance of each from the cube's edges.
-
-    Bumps are along the normals, 0.2 mm high (rms).
-    """
-    bumps = np.zeros(len(CUBE.vertices))
+def bumps(places_m: Array, rng: np.random.Generator) -> Array:
+    """Return heights (n,) of waves several triangles long, of root mean square 0.2 mm."""
+    heights = np.zeros(len(places_m))
     for _ in range(40):
         wave = rng.normal(0.0, 2.0 * np.pi / 0.02, 3)
-        bumps += np.cos(CUBE.vertices @ wave + rng.uniform(0.0, 2.0 * np.pi))
-    vertices_m = CUBE.vertices + 2e-4 * (bumps / bumps.std())[:, None] * CUBE.vertex_normals
+        heights += np.cos(places_m @ wave + rng.uniform(0.0, 2.0 * np.pi))
+    return 2e-4 * heights / heights.std()
+
+
+def bumpy_cube(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return the cube's vertices off by bumps along the normals, and the distance of each from the cube's edges."""
+    vertices_m = CUBE.vertices + bumps(np.asarray(CUBE.vertices), rng)[:, None] * CUBE.vertex_normals
     return np.asarray(vertices_m), 0.05 - np.sort(np.abs(CUBE.vertices), axis=1)[:, 1]
 
 
@@ -181,10 +184,7 @@ def test_flat_gets_flat_edges_stay_and_no_vertex_moves_beyond_its_limit(rng: np.
 
 def test_rounded_surface_gets_smooth_not_faceted(rng: np.random.Generator) -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
-    bumps = np.zeros(len(ball.vertices))
-    for _ in range(40):
-        bumps += np.cos(ball.vertices @ rng.normal(0.0, 2.0 * np.pi / 0.02, 3) + rng.uniform(0.0, 2.0 * np.pi))
-    vertices_m = ball.vertices * (1.0 + 2e-4 / 0.05 * bumps / bumps.std())[:, None]
+    vertices_m = ball.vertices * (1.0 + bumps(np.asarray(ball.vertices), rng) / 0.05)[:, None]
     smooth_m = meshing.without_relief(vertices_m, ball.faces, np.full(len(vertices_m), 4e-4))
 
     def errors_deg(of_m: Array) -> Array:
@@ -267,16 +267,7 @@ def test_crumbs_along_the_seam_and_where_views_know_little_are_smoothed(
 
 def test_a_mesh_of_many_triangles_is_unwrapped_in_pieces_without_overlap() -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
-    nothing = np.zeros((0, 3))
-    model = ObjectModel(
-        points_m=nothing,
-        normals=nothing,
-        colours=None,
-        vertices_m=np.asarray(ball.vertices),
-        triangles=np.asarray(ball.faces, dtype=np.int64),
-        vertex_normals=np.asarray(ball.vertices) / 0.05,
-        vertex_colours=None,
-    )
+    model = model_of(ball)
     assert len(model.triangles) > 3 * PIECE
 
     def paint(points_m: Array, *_: npt.NDArray[np.generic]) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:

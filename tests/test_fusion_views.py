@@ -164,7 +164,7 @@ def test_conditional_covariances_do_not_know_of_drift(rng):
 def test_sharp_views_have_more_say_in_colours_than_blurred_ones(rng):
     def textured(view: RayImage, spread: int) -> RayImage:
         levels = 120 + rng.integers(-spread, spread + 1, view.frame.depth_m.shape)
-        return replace(view, frame=replace(view.frame, colour=np.repeat(levels[..., None], 3, axis=2).astype(np.uint8)))
+        return tabletop.recoloured(view, levels)
 
     views = {k: textured(view, 60 if k % 3 else 20) for k, view in tabletop.views(BRICK, POSES).items()}
     seen = view_blocks(posed_views(views, tabletop.trajectory(POSES)), CORNERS_M, CROPPING)

@@ -221,17 +221,10 @@ def test_every_fault_is_one_line_and_leaves_nothing(
 LINKS = [
     *((kind, D) for kind in FAULTS),
     *((kind, "depth") for kind in FAULTS),
-    ("bop", B),
-    ("bop", "scene_gt.json"),
-    ("bop", "sequence.json"),
-    ("bop", "mask_visib/*.png"),
-    ("tum", T),
-    ("tum", "groundtruth.txt"),
-    ("tum", C),
-    ("open3d", O),
-    ("open3d", "trajectory.log"),
-    ("bundlesdf", K),
-    ("bundlesdf", "annotated_poses/*.txt"),
+    *(("bop", name) for name in (B, "scene_gt.json", "sequence.json", "mask_visib/*.png")),
+    *(("tum", name) for name in (T, "groundtruth.txt", C)),
+    *(("open3d", name) for name in (O, "trajectory.log")),
+    *(("bundlesdf", name) for name in (K, "annotated_poses/*.txt")),
 ]
 
 

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from command_runner import Run
 
-from modeler import fusion, se3
+from modeler import se3
 from modeler.experiment import Modelled, ModelScore, model_scores
 from modeler.fusion import Fuser, Matcher
 from modeler.sequences import bundled, open_sequence, true_mesh
@@ -208,7 +208,7 @@ def test_a_joined_run_is_judged_where_its_parts_know_one_surface(
 ) -> None:
     joined = tmp_path / "joined"
     shutil.copytree(built, tmp_path / "other")
-    monkeypatch.setattr(fusion, "Matcher", lambda: Matcher(rotations=40, scored=5))
+    monkeypatch.setattr("modeler.pipeline.joining.Matcher", lambda: Matcher(rotations=40, scored=5))
     assert cli("join", built, tmp_path / "other", "--out", joined, "--pairs", "2")[0] in (0, 3)
     status, out, err = cli("evaluate", joined, "--out", tmp_path / "scores")
     assert (status, err) == (0, "")

@@ -1,11 +1,9 @@
 """Models of an object that lies still among others before a camera that moves."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
 from segmentation_worlds import CAMERA, OBJECT, World, iou
 
 import modeler
@@ -15,6 +13,8 @@ from modeler.runs.reopening import reopened
 from modeler.segmentation import Segmenter
 from modeler.types import Camera, Frame, Outcome, Step
 from modeler.views import Sensor
+from studies.formats.image_folders import raw_depth, save
+from studies.formats.other_programs import write_camera
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +49,9 @@ def test_a_view_holds_what_stands_beside_the_object(going_round):
 
 def test_a_model_is_of_the_object_alone_and_stays_so_when_its_run_is_opened_again(going_round, tmp_path):
     frames, masks = going_round
-    (tmp_path / "scan" / "depth").mkdir(parents=True)
-    intrinsics = {"fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy, "depth_scale": 0.1}
-    (tmp_path / "scan" / "camera.json").write_text(json.dumps(intrinsics))
     for frame in frames:
-        units = np.rint(np.nan_to_num(frame.depth_m) / 1e-4).astype(np.uint16)
-        Image.fromarray(units).save(tmp_path / "scan" / "depth" / f"{frame.index:06d}.png")
+        save(tmp_path / "scan" / "depth" / f"{frame.index:06d}.png", raw_depth(frame, 0.1))
+    write_camera(tmp_path / "scan", CAMERA, depth_scale=0.1)
     found = modeler.build(tmp_path / "scan", tmp_path / "run")
     assert sorted(found.solution.trajectory) == list(range(8))
     again = reopened(tmp_path / "run")
@@ -87,31 +84,36 @@ def test_masks_that_most_frames_are_unsure_of_stay_unsure(going_round, monkeypat
         assert ("unsure_masks" in [fault.code for fault in last.verdict.shortcomings]) == (len(few) > 4)
 
 
-def test_masks_are_those_of_most_views():
-    camera, rng = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), np.random.default_rng(0)
-    depth_m = np.full((48, 64), 0.5, np.float32) + rng.normal(0.0, 1e-4, (48, 64)).astype(np.float32)
+def true_and_wrong():
+    """Return the pixels (h, w) of an object and of another thing."""
     true, wrong = np.zeros((2, 48, 64), dtype=np.bool_)
     true[15:30, 20:40], wrong[5:12, 45:60] = True, True
-    views = {k: Sensor().ray_image(Frame(k, float(k), depth_m, camera, np.ones_like(true))) for k in range(5)}
-    found = {k: wrong if k == 3 else true for k in views}
-    most = Majority(views, found.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01)
-    for frame in views:
+    return true, wrong
+
+
+def majority(seen, found):
+    """Return what most views say that see masks `seen` of a wall, and find `found` to be the object."""
+    camera, rng = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), np.random.default_rng(0)
+    depth_m = np.full((48, 64), 0.5, np.float32) + rng.normal(0.0, 1e-4, (48, 64)).astype(np.float32)
+    views = {k: Sensor().ray_image(Frame(k, float(k), depth_m, camera, mask)) for k, mask in enumerate(seen)}
+    return Majority(views, found.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01)
+
+
+def test_masks_are_those_of_most_views():
+    true, wrong = true_and_wrong()
+    found = [true, true, true, wrong, true]
+    most = majority([np.ones_like(true)] * 5, found)
+    for frame in range(5):
         assert iou(most.mask(frame), true) > 0.9
     assert most.sure
-    other = {0: true, 1: true, 2: wrong, 3: wrong.T[:48, :48].repeat(2, axis=1)[:, :64], 4: ~true & ~wrong}
-    assert not Majority(views, other.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01).sure
+    other = [true, true, wrong, wrong.T[:48, :48].repeat(2, axis=1)[:, :64], ~true & ~wrong]
+    assert not majority([np.ones_like(true)] * 5, other).sure
 
 
 def test_a_thing_that_few_views_take_for_the_object_is_no_part_of_it():
-    camera, rng = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), np.random.default_rng(0)
-    depth_m = np.full((48, 64), 0.5, np.float32) + rng.normal(0.0, 1e-4, (48, 64)).astype(np.float32)
-    true, wrong = np.zeros((2, 48, 64), dtype=np.bool_)
-    true[15:30, 20:40], wrong[5:12, 45:60] = True, True
-    everything = np.ones_like(true)
-    seen = [everything & ~wrong, everything & ~wrong, everything & ~wrong, everything, everything]  # who alone sees it
-    views = {k: Sensor().ray_image(Frame(k, float(k), depth_m, camera, mask)) for k, mask in enumerate(seen)}
-    found = [true, true, true, wrong, wrong]
-    most = Majority(views, found.__getitem__, dict.fromkeys(views, np.eye(4)), 0.01)
-    for frame in views:
+    true, wrong = true_and_wrong()
+    seen = [~wrong] * 3 + [np.ones_like(true)] * 2  # who alone sees it
+    most = majority(seen, [true, true, true, wrong, wrong])
+    for frame in range(5):
         assert not (most.mask(frame) & wrong).any()
         assert iou(most.mask(frame), true) > 0.9

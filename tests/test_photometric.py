@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import ndimage
+from tabletop import recoloured
 
 import modeler
 from modeler import se3
@@ -209,7 +210,7 @@ def test_the_peak_that_a_label_makes_on_the_ridge_of_a_spin_is_drawn(printed, se
 
 def test_what_stays_in_its_place_is_found_though_centroids_err(printed):
     (view, _), _ = printed
-    aside = replace(view, frame=replace(view.frame, colour=np.roll(view.frame.colour, (1, -1), axis=(0, 1))))
+    aside = recoloured(view, np.roll(np.asarray(view.frame.colour), (1, -1), axis=(0, 1)))
     pair = VisibilityLikelihood().between(view, aside, np.random.default_rng(0))
     assert all(pair.colour.static_correlation(band) > 0.8 for band in range(3))
 
@@ -229,7 +230,7 @@ def test_a_shift_of_colours_widens_the_spin_and_does_not_mislead(printed):
     moved = np.stack(
         [ndimage.shift(colour[..., k], (0.0, shift_px), order=1, mode="nearest") for k in range(3)], axis=-1
     )
-    loose[1] = replace(loose[1], frame=replace(loose[1].frame, colour=moved))
+    loose[1] = recoloured(loose[1], moved)
     aligned, shifted = registered(views, colour=True), registered((loose[0], loose[1]), colour=True)
     assert nees(shifted.pose, truth) / 6.0 < 3.0
     assert np.trace(shifted.pose.covariance[:3, :3]) > np.trace(aligned.pose.covariance[:3, :3])
@@ -244,7 +245,7 @@ def test_light_says_nothing_of_the_spin_of_a_plain_tin():
 
 def test_without_colour_pairs_are_what_depth_says(printed):
     views, _ = printed
-    first, second = (replace(view, frame=replace(view.frame, colour=None)) for view in views)
+    first, second = (recoloured(view, None) for view in views)
     without, switched_off = registered((first, second), colour=True), registered(views, colour=False)
     np.testing.assert_array_equal(without.pose.mean, switched_off.pose.mean)
     np.testing.assert_array_equal(without.pose.covariance, switched_off.pose.covariance)

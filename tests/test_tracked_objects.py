@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from run_builders import model_of
 from scipy import stats
 from slow_cases import quick_first
 
@@ -30,13 +31,6 @@ from studies.tracking.clutter import model_of as model_on_table
 from studies.tracking.clutter import noise, scene
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
-
-
-def model_of(mesh: trimesh.Trimesh) -> ObjectModel:
-    normals = np.asarray(mesh.vertex_normals, np.float64)
-    empty = np.zeros((0, 3))
-    return ObjectModel(empty, empty, None, np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64),
-                       normals, None)  # fmt: skip
 
 
 @cache

@@ -161,9 +161,8 @@ def printed_views(poses: list[Array]) -> dict[int, RayImage]:
         grey = np.full(one.frame.depth_m.shape, 60.0)
         on_body_m = se3.transform(se3.inverse(poses[k]), one.points_m)
         grey[tuple(one.pixels.T)] = 120.0 + 12.0 * np.sum(np.sin(on_body_m @ waves.T + phases), axis=1)
-        grey = np.clip(grey + rng.normal(size=grey.shape), 0.0, 255.0).astype(np.uint8)
-        colour = np.ascontiguousarray(np.broadcast_to(grey[..., None], (*grey.shape, 3)))
-        views[k] = sensor.ray_image(replace(one.frame, colour=colour))
+        grey = np.clip(grey + rng.normal(size=grey.shape), 0.0, 255.0)
+        views[k] = sensor.ray_image(tabletop.recoloured(one, grey).frame)
     return views
 
 
