@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tabletop
-from test_pipeline import FRAMES, Oracle, modeler
+from test_pipeline import COLOURED, Oracle, modeler
 
 from modeler.pipeline import Run
 from modeler.pipeline.state import State
@@ -66,7 +66,7 @@ def test_a_run_with_its_views_on_disk_has_the_same_result() -> None:
     def last(store: ViewStore) -> Step:
         hidden = frozenset({2, 3})
         run = Run(modeler(registrar=Oracle(noise=1.0, blind=hidden)), Scene(), State(store=store))
-        events = [*run.track(FRAMES), *run.revisit(), *run.refine(), *run.finish()]
+        events = [*run.track(COLOURED), *run.revisit(), *run.refine(), *run.finish()]
         assert isinstance(events[-1], Step)
         return events[-1]
 
