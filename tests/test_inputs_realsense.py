@@ -233,10 +233,11 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[[StandIn], None]:
     """Return what makes a stand-in the camera that `realsense:` opens."""
 
     def plugged(camera: StandIn) -> None:
-        monkeypatch.setattr(
-            "modeler.sequences.open_sequence",
-            lambda path, *_: begin(camera.camera, 2) if str(path) == "realsense:" else open_sequence(path),
-        )
+        for module in ("modeler.sequences", "modeler.cli.reading"):
+            monkeypatch.setattr(
+                f"{module}.open_sequence",
+                lambda path, *_: begin(camera.camera, 2) if str(path) == "realsense:" else open_sequence(path),
+            )
 
     return plugged
 
