@@ -7,18 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from scipy import ndimage
 
 from modeler import se3
+from modeler.closure import MapView
 from modeler.pipeline.attempts import told_otherwise
 from modeler.pipeline.joining import MAX_VIEWS, MIN_JOINS, Joiner, Segment, rejected_elsewhere
 from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import State
 from modeler.pipeline.tracking import Tracker
-from modeler.types import Array, BoolArray, Edge, Outcome, RayImage, Searching, Segmentation, spread
+from modeler.types import (
+    Array,
+    BoolArray,
+    Consistency,
+    Edge,
+    Outcome,
+    Posterior,
+    RayImage,
+    Searching,
+    Segmentation,
+    spread,
+)
 from modeler.verdict.evidence import (
     FreeSpace,
     default_tolerance_m,
@@ -35,6 +48,7 @@ LEAST_TURN_DEG: Final = 45.0  # measured: an arm that was registered 23° and 24
 """Largest rotation between two views from which on what was registered is the object, and not an arm that turns it."""
 _SETTLED: Final = 0.05  # share of the pixels of all masks: rims differ by as much between masks that are both right
 _POINTS: Final = 5000  # of a view that are looked up in others: 1.5 % of its size apart
+_MIN_CONTRADICTING: Final = 2  # edges: one may match by chance
 _BLUR: Final = 0.04  # of the mask's size, over which looks are pooled; 0.02 and 0.08 give the same masks to 2 %
 
 
@@ -124,35 +138,64 @@ def remasked(prepared: Prepared, mask: BoolArray, sensor: Sensor) -> Prepared:
     return Prepared(prepared.frame, found, view if len(view.points_m) else None)
 
 
+def contradicting(state: State) -> list[Edge]:
+    """Return edges of the refinement that determine a motion and contradict the poses."""
+    return [edge for edge in state.spans if isinstance(edge.reason, Consistency) and not edge.accepted]
+
+
+def most_crossed(state: State, edges: Sequence[Edge]) -> tuple[int, int]:
+    """Return the two successive views that most edges lead across, of several those with the least certain motion."""
+    order, places = sorted(state.views, key=lambda frame: state.places[frame]), state.places
+    across = [sorted((places[edge.target], places[edge.source])) for edge in edges]
+
+    def crossed(gap: tuple[int, int]) -> tuple[int, float]:
+        count = sum(low <= places[gap[0]] and places[gap[1]] <= high for low, high in across)
+        return count, float(np.trace(state.solution.relative_gaussian(*gap).covariance[:3, :3]))
+
+    return max(pairwise(order), key=crossed)
+
+
 @dataclass(frozen=True)
 class Realigner:
-    """Aligns two parts of a run anew while surface of one violates the other's free space (docs/method/segments.md).
+    """Aligns two parts of a run anew where its views contradict their poses (docs/method/segments.md).
 
-    A pair that matches by chance, as similar sides of an object do, misplaces all frames from it on. Alignments of both
-    parts are judged by all their views.
+    They do where surface of one violates the other's free space, and where registrations of the refinement contradict
+    them. A pair that matches by chance, as similar sides of an object do, misplaces all frames from it on. Alignments
+    of both parts are judged by all their views.
     """
 
     tracker: Callable[[State], Tracker]
     """Returns the tracker of a state."""
     joiner: Callable[[Tracker], Joiner]
     """Returns the joiner of segments."""
+    judge: Callable[[Posterior, MapView], Edge]
+    """Returns the edge of a further registration between two views of a map."""
     tolerance_m: float | None = None
     """Error of the surface above which a model is called wrong; None: `default_tolerance_m`."""
 
     def realigned(self, state: State) -> Generator[Searching, None, State]:
-        """Return a state whose views violate each other's free space less, or the same one."""
+        """Return a state that its views contradict less, or the same one."""
         tried: set[tuple[int, int]] = set()
-        while (free := self.free_space(state)) is not None and not free.holds:
-            gap = self._most_contradicted(state, free)
-            if gap is None or gap in tried:
-                break
+        while (gap := self._gap(state)) is not None and gap not in tried:
             tried.add(gap)
             other = yield from self._aligned_across(state, *gap)
-            found = None if other is None else self.free_space(other)
-            if other is None or found is None or found.excess >= free.excess:
+            if other is None or self.contradictions(other) >= self.contradictions(state):
                 break
             state = other
         return state
+
+    def contradictions(self, state: State) -> tuple[float, int]:
+        """Return free-space violations in units of their limit, 1 within it, and the number of contradicting spans."""
+        free, spans = self.free_space(state), len(contradicting(state))
+        return (1.0 if free is None else max(free.excess, 1.0)), (spans if spans >= _MIN_CONTRADICTING else 0)
+
+    def _gap(self, state: State) -> tuple[int, int] | None:
+        """Return the two successive views across which most is contradicted; None if all holds."""
+        free = self.free_space(state)
+        if free is not None and not free.holds:
+            return self._most_contradicted(state, free)
+        spans = contradicting(state)
+        return most_crossed(state, spans) if len(spans) >= _MIN_CONTRADICTING else None
 
     def free_space(self, state: State, among: Iterable[int] | None = None) -> FreeSpace | None:
         """Return the free-space violations between views of a state, by default all, as the verdict judges them."""
@@ -181,8 +224,15 @@ class Realigner:
             return None
         kept = {*target.graph.edges, *source.graph.edges}
         others = [edge for edge in state.graph.edges if edge not in kept]
-        rejected = [rejected_elsewhere(edge, merged.solution) if edge.accepted else edge for edge in others]
-        return merged.refined(rejected).with_spans()
+        again = [
+            rejected_elsewhere(edge, merged.solution)
+            if edge.accepted
+            else self.judge(edge.posterior, merged.map_view)
+            if edge in state.spans
+            else edge
+            for edge in others
+        ]
+        return merged.refined(again).with_spans()
 
     def _most_contradicted(self, state: State, free: FreeSpace) -> tuple[int, int] | None:
         """Return the two successive views across which most surface violates free space, if any does."""

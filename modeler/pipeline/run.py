@@ -164,7 +164,9 @@ class Run:
             yield event
 
     def correct(self) -> Iterator[Step | Searching | Refining]:
-        """Where surface violates free space, make masks anew, then align parts anew; keep what violates it less.
+        """Where surface violates free space, make masks anew, then align parts anew; keep what is contradicted less.
+
+        Parts are aligned anew as well where registrations of the refinement contradict the poses.
 
         Yields the steps of the frames whose masks are others.
         """
@@ -172,20 +174,18 @@ class Run:
         if before.newest is None:
             return
         self._solve()
-        realigner = Realigner(self.modeler.tracker, self.modeler.joiner, self.modeler.tolerance_m)
+        parts = self.modeler
+        realigner = Realigner(parts.tracker, parts.joiner, parts.closer.judge_span, parts.tolerance_m)
         free = realigner.free_space(self.state)
         if free is not None and not free.holds and self.scene.finds_masks:
             before, free = yield from self._remasked(realigner, before, free)
-        if free is None or free.holds:
-            return
         realigned = yield from realigner.realigned(before)
         if realigned is before:
             return
         other = replace(self, state=realigned)
         yield from other.refine()
         other._solve()
-        again = realigner.free_space(other.state)
-        if again is not None and again.excess < free.excess:
+        if realigner.contradictions(other.state) < realigner.contradictions(self.state):
             self.state = self._solved = other.state
 
     def finish(self, *, interrupted: bool = False) -> Iterator[Step | Fusing]:
