@@ -48,7 +48,6 @@ LEAST_TURN_DEG: Final = 45.0  # measured: an arm that was registered 23° and 24
 """Largest rotation between two views from which on what was registered is the object, and not an arm that turns it."""
 _SETTLED: Final = 0.05  # share of the pixels of all masks: rims differ by as much between masks that are both right
 _POINTS: Final = 5000  # of a view that are looked up in others: 1.5 % of its size apart
-_MIN_CONTRADICTING: Final = 2  # edges: one may match by chance
 _BLUR: Final = 0.04  # of the mask's size, over which looks are pooled; 0.02 and 0.08 give the same masks to 2 %
 
 
@@ -187,7 +186,7 @@ class Realigner:
     def contradictions(self, state: State) -> tuple[float, int]:
         """Return free-space violations in units of their limit, 1 within it, and the number of contradicting spans."""
         free, spans = self.free_space(state), len(contradicting(state))
-        return (1.0 if free is None else max(free.excess, 1.0)), (spans if spans >= _MIN_CONTRADICTING else 0)
+        return (1.0 if free is None else max(free.excess, 1.0)), (spans if spans >= MIN_JOINS else 0)
 
     def _gap(self, state: State) -> tuple[int, int] | None:
         """Return the two successive views across which most is contradicted; None if all holds."""
@@ -195,7 +194,7 @@ class Realigner:
         if free is not None and not free.holds:
             return self._most_contradicted(state, free)
         spans = contradicting(state)
-        return most_crossed(state, spans) if len(spans) >= _MIN_CONTRADICTING else None
+        return most_crossed(state, spans) if len(spans) >= MIN_JOINS else None
 
     def free_space(self, state: State, among: Iterable[int] | None = None) -> FreeSpace | None:
         """Return the free-space violations between views of a state, by default all, as the verdict judges them."""
