@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +16,7 @@ from PIL import Image
 
 EXECUTABLE = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 needs_chromium = pytest.mark.skipif(EXECUTABLE is None, reason="Chromium is not installed")
-_PATIENCE_MS = 60_000
+_PATIENCE_S = 60.0
 _FLAGS = (
     "--no-sandbox",
     "--disable-dev-shm-usage",
@@ -45,7 +46,7 @@ class Page:
         self.requested: list[str] = []
         """Addresses that the page asked for."""
         self._page = browser.new_page(viewport={"width": width, "height": height})
-        self._page.set_default_timeout(_PATIENCE_MS)
+        self._page.set_default_timeout(1000.0 * _PATIENCE_S)
         self._page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self._page.on("console", self._note)
         self._page.on("request", lambda request: self.requested.append(request.url))
@@ -63,8 +64,14 @@ class Page:
         return self._page.evaluate(expression)
 
     def wait_for(self, expression: str) -> None:
-        """Return when an expression in JavaScript comes true."""
-        self._page.wait_for_function(expression)
+        """Return when an expression in JavaScript comes true.
+
+        `wait_for_function` evaluates it within the page, which pages with a content security policy refuse.
+        """
+        until_s = time.monotonic() + _PATIENCE_S
+        while not self.value(expression):
+            assert time.monotonic() < until_s, f"{expression} is not true after {_PATIENCE_S} s"
+            self._page.wait_for_timeout(50.0)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         """Drag from one point of the window to another."""
