@@ -47,16 +47,18 @@ def test_what_is_forbidden_has_no_likelihood(noise, options, seed):
     source, target = (scene(rng, noise, (0.0, 1e-3, 0.02)[seed % 3]) for _ in range(2))
     free = FreeSpace.of(source, target, *options)
     poses = rows(np.stack([random_pose(rng, 0.3) for _ in range(300)]))
-    back = rows(se3.inverse(matrices(poses)))
-    forbidden = [np.array([~kernel.passing(motions, one[None], *side[1:]) for one in side[0]])
-                 for motions, side in ((poses, free.forward), (back, free.backward))]  # fmt: skip
-    assert 0.02 < np.mean(forbidden) < 0.98
-    np.testing.assert_array_equal(free.passes(poses), ~np.concatenate(forbidden).any(axis=0))
-    sides = ((poses, source, target, forbidden[0]), (back, target, source, forbidden[1]))
-    for motions, own, other, rejects in sides:
-        for point, rejected in zip(own.points_m, rejects, strict=True):
+    verdicts = kernel.verdicts(poses, free.checks, free.near_m, free.images)
+    assert 0.02 < verdicts.mean() < 0.98
+    np.testing.assert_array_equal(free.passes(poses), ~verdicts.any(axis=1))
+    sides = (
+        (poses, source, target, verdicts[:, :12]),
+        (rows(se3.inverse(matrices(poses))), target, source, verdicts[:, 12:]),
+    )
+    for motions, own, other, forbidden in sides:
+        for k, point in enumerate(own.points_m):
+            rejected = motions[forbidden[:, k]]
             values = kernel.log_likelihoods(
-                motions[rejected], point[None], other.ranges_m, other.intrinsics, noise, np.array(options)
+                rejected, point[None], other.ranges_m, other.intrinsics, noise, np.array(options)
             )
             assert np.isneginf(values).all()
 
@@ -81,10 +83,23 @@ def test_order_changes_no_verdict(rng):
     free = FreeSpace.of(scene(rng, NOISES["isotropic"]), scene(rng, NOISES["isotropic"]), 4.0, 1e-6)
     poses = rows(np.stack([random_pose(rng, 0.3) for _ in range(300)]))
     ordered = free.ordered(poses)
-    np.testing.assert_array_equal(np.sort(ordered.forward[0], axis=0), np.sort(free.forward[0], axis=0))
+    np.testing.assert_array_equal(np.sort(ordered.checks, axis=0), np.sort(free.checks, axis=0))
     np.testing.assert_array_equal(ordered.passes(poses), free.passes(poses))
-    passing = [np.count_nonzero(kernel.passing(poses, one[None], *free.forward[1:])) for one in ordered.forward[0]]
-    assert passing[0] == min(passing)
+    forbidden = kernel.verdicts(poses, free.checks, free.near_m, free.images)
+    first = kernel.verdicts(poses, ordered.checks[:1], ordered.near_m, ordered.images)
+    assert first.sum() == forbidden.sum(axis=0).max()
+
+
+def test_nearest_ranges_are_least_within_the_ellipse(rng):
+    ranges_m = rng.uniform(0.5, 2.0, (14, 17))
+    reach_px = np.array([3.3, 2.2])
+    near_m = kernel.nearest_ranges(ranges_m, reach_px)
+    across, down = (near_m.shape[1] - 17) // 2, (near_m.shape[0] - 14) // 2
+    row, column = np.indices(ranges_m.shape)
+    for v, u in rng.uniform([-down, -across], [13 + down, 16 + across], (500, 2)):
+        within = ((column - u) / reach_px[0]) ** 2 + ((row - v) / reach_px[1]) ** 2 <= 1.0
+        least = ranges_m[within].min() if within.any() else np.inf
+        assert near_m[int(v + down + 0.5), int(u + across + 0.5)] <= least
 
 
 @pytest.mark.slow

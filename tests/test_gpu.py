@@ -13,7 +13,7 @@ from test_kernels import random_pose
 
 from modeler.baselines import PaperRegistrar
 from modeler.baselines.paper import FreeSpace, NumberedDraws, measured
-from modeler.kernels import gpu
+from modeler.kernels import gpu, paper
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.se3 import rows
 from modeler.sequences import bundled
@@ -44,15 +44,19 @@ def device(request):
 
 
 @pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
-def test_the_papers_likelihood_is_that_of_numba(device, noise, rng):
-    from modeler.kernels.gpu.paper import OnDevice
+def test_the_papers_likelihood_and_nearest_ranges_are_those_of_numba(device, noise, rng):
+    from modeler.kernels.gpu.paper import OnDevice, nearest_ranges
 
     there = gpu.chosen(device, 1) or ""
     source, target = (scene(rng, noise, gaps=0.5) for _ in range(2))
+    reach_px = np.array([3.7, 5.2])
+    np.testing.assert_array_equal(
+        nearest_ranges(target.ranges_m, reach_px, there), paper.nearest_ranges(target.ranges_m, reach_px)
+    )
     poses = rows(np.stack([random_pose(rng, 0.1) for _ in range(200)]))
     free = FreeSpace.of(source, target, 4.0, 1e-6)
     views = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in (source, target)]
-    on_device = OnDevice.of(there, views, (free.forward, free.backward), (4.0, 0.0))
+    on_device = OnDevice.of(there, views, (free.checks, free.near_m, free.images), (4.0, 0.0))
     want, got = PaperRegistrar(reject_below=0.0).log_weights(poses, (source, target)), on_device.log_likelihoods(poses)
     assert np.isfinite(want).any()
     np.testing.assert_allclose(got, want, rtol=1e-9)  # -inf where it is -inf
@@ -66,7 +70,7 @@ def test_the_papers_draws_that_pass_are_those_of_numba_in_their_order(device, rn
     draws = NumberedDraws.of(GeneralPrior(25.0, 0.02).between(standing(1), standing(0)), np.random.default_rng(3))
     free = FreeSpace.of(source, target, 4.0, 1e-6).ordered(draws.poses(0, 500))
     views = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in (source, target)]
-    there = on_gpu.OnDevice.of(gpu.chosen(device, 1) or "", views, (free.forward, free.backward), (4.0, 1e-6))
+    there = on_gpu.OnDevice.of(gpu.chosen(device, 1) or "", views, (free.checks, free.near_m, free.images), (4.0, 1e-6))
     tried, got, found = zip(*there.weighted_draws(10_000, draws.seed, draws.limits), strict=True)
     poses = draws.poses(0, 10_000)
     passing = poses[free.passes(poses)]

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
-from scipy import ndimage
 
 from modeler import se3
 from modeler.kernels import gpu
@@ -113,24 +112,25 @@ class PaperRegistrar(AbstractRegistrar):
         draws = NumberedDraws.of(density, rng)
         samples = self.samples or (_SAMPLES if draws is None else _UNIFORM_SAMPLES)
         device = gpu.chosen(self.device, samples * sum(len(view.points_m) for view in views))
+        free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below, device=device)
         batches = self._drawn(density if draws is None else draws, samples, rng)
-        first, there = next(batches), None
-        free = FreeSpace.of(*views, self.reach_sigmas, self.reject_below).ordered(first[:4096])
-        if device is not None:
-            from modeler.kernels.gpu.paper import OnDevice
-
-            seen = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in views]
-            tests = free.forward, free.backward
-            there = OnDevice.of(device, seen, tests, (self.reach_sigmas, self.reject_below))
-            if draws is not None:
-                yield from there.weighted_draws(samples, draws.seed, draws.limits)
-                return
-        for poses in chain([first], batches):
-            if there is not None:
-                yield len(poses), *there.weighted(poses)
-            else:
+        first = next(batches)
+        free = free.ordered(first[:4096])
+        if device is None:
+            for poses in chain([first], batches):
                 passing = poses[free.passes(poses)]
                 yield len(poses), passing, self.log_weights(passing, views)
+            return
+        from modeler.kernels.gpu.paper import OnDevice
+
+        seen = [(view.points_m, view.ranges_m, view.intrinsics, view.noise) for view in views]
+        tests = free.checks, free.near_m, free.images
+        there = OnDevice.of(device, seen, tests, (self.reach_sigmas, self.reject_below))
+        if draws is not None:
+            yield from there.weighted_draws(samples, draws.seed, draws.limits)
+            return
+        for poses in chain([first], batches):
+            yield len(poses), *there.weighted(poses)
 
     def _drawn(
         self, density: AbstractPoseDensity | NumberedDraws, samples: int, rng: np.random.Generator
@@ -191,10 +191,6 @@ class Measured:
     """(3, 3) L, the covariance of the sensor in ray coordinates (w, h, r)."""
 
 
-Side = tuple[Array, np.ndarray, Array]
-"""Checks (n, 4), least ranges (h, w) and image (7,) of a view's points in the other, see `kernels.paper.forbidden`."""
-
-
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
     """A test that a pose fails only if it gives some point a density below `reject_below` under eq. pbd.
@@ -206,39 +202,40 @@ class FreeSpace:
     pixel within the widest reach has a sum below the threshold, whatever D and v are.
     """
 
-    forward: Side
-    """Of the source's points in the target."""
-    backward: Side
-    """Of the target's points in the source."""
+    checks: Array
+    """(n, 5), see `kernels.paper`."""
+    near_m: tuple[np.ndarray, np.ndarray]
+    """`nearest_ranges` of target and source."""
+    images: tuple[Array, Array]
+    """Their images, see `kernels.paper.forbidden`."""
 
     @staticmethod
-    def of(source: Measured, target: Measured, reach_sigmas: float, reject_below: float) -> FreeSpace:
-        """Return the test for two views; with an infinite reach or no threshold, every pose passes."""
+    def of(
+        source: Measured, target: Measured, reach_sigmas: float, reject_below: float, *, device: str | None = None
+    ) -> FreeSpace:
+        """Return the test for two views; with an infinite reach or no threshold, every pose passes.
+
+        Nearest ranges are computed on a Warp device, or by the Numba kernels.
+        """
         limits = reach_sigmas, reject_below
-        return FreeSpace(_side(source, target, limits), _side(target, source, limits))
+        sides = _side(source, target, limits, device), _side(target, source, limits, device)
+        checks = np.concatenate([np.insert(side[0], kernel.BACKWARD, k, axis=1) for k, side in enumerate(sides)])
+        return FreeSpace(checks, (sides[0][1], sides[1][1]), (sides[0][2], sides[1][2]))
 
     def ordered(self, poses: Array) -> FreeSpace:
-        """Return the test with the checks of each side ordered greedily by how many of the remaining poses they reject.
-
-        `poses` (m, 12) are some of those to be tested.
-        """
-
-        def ordered(side: Side, poses: Array) -> Side:
-            checks, near_m, image = side
-            order, left = list[int](), np.array([~kernel.passing(poses, one[None], near_m, image) for one in checks])
-            while left.any():
-                order.append(int(left.sum(axis=1).argmax()))
-                left = left[:, ~left[order[-1]]]
-            order += sorted({*range(len(checks))} - {*order})
-            return checks[order], near_m, image
-
-        return FreeSpace(ordered(self.forward, poses), ordered(self.backward, rows(se3.inverse(matrices(poses)))))
+        """Return the test with its checks ordered greedily by how many of the remaining poses (m, 12) they reject."""
+        forbidden = kernel.verdicts(poses, self.checks, self.near_m, self.images)
+        order: list[int] = []
+        left = forbidden
+        while len(left) and left.any():
+            order.append(int(left.sum(axis=0).argmax()))
+            left = left[~left[:, order[-1]]]
+        rest = np.setdiff1d(np.argsort(-forbidden.sum(axis=0), kind="stable"), order, assume_unique=True)
+        return replace(self, checks=np.ascontiguousarray(self.checks[np.concatenate([order, rest]).astype(int)]))
 
     def passes(self, poses: Array) -> BoolArray:
-        """Return whether poses (m, 12) of target_from_source pass, (m,)."""
-        passing = kernel.passing(poses, *self.forward)
-        passing[passing] = kernel.passing(rows(se3.inverse(matrices(poses[passing]))), *self.backward)
-        return passing
+        """Return whether poses (m, 12) pass, (m,)."""
+        return kernel.passing(poses, self.checks, self.near_m, self.images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +260,10 @@ class NumberedDraws:
         return kernel.drawn(np.arange(first, first + count), self.seed, self.limits)
 
 
-def _side(own: Measured, other: Measured, limits: tuple[float, float]) -> Side:
+def _side(
+    own: Measured, other: Measured, limits: tuple[float, float], device: str | None
+) -> tuple[Array, np.ndarray, Array]:
+    """Return checks (n, 4) of one view's points against the other, and the other's nearest ranges and image."""
     reach_sigmas, reject_below = limits
     fx, fy, cx, cy = other.intrinsics
     noise = other.noise
@@ -276,13 +276,22 @@ def _side(own: Measured, other: Measured, limits: tuple[float, float]) -> Side:
     reach_px = reach_sigmas * np.sqrt(lateral + spread_m2.max() * widening) * np.array([fx, fy]) + 1e-6
     if not (reject_below > 0.0 and np.all(reach_px < max(other.ranges_m.shape))):
         return np.zeros((0, 4)), np.zeros((1, 1), dtype=np.float32), np.zeros(7)
-    across, down = np.ceil(reach_px + 0.5).astype(np.int64)  # a point may be half a pixel from the one it rounds to
-    padded_m = np.pad(other.ranges_m * (1.0 - 1e-6), ((down, down), (across, across)), constant_values=np.inf)
-    size = 2 * down + 1, 2 * across + 1
-    near_m = ndimage.minimum_filter(padded_m.astype(np.float32), size, mode="nearest")  # 0 excludes nothing
+    near_m = _nearest_ranges(other.ranges_m, reach_px, device)
+    across, down = (
+        (near - full) // 2 for near, full in zip(near_m.shape[::-1], other.ranges_m.shape[::-1], strict=True)
+    )
     # K2 is at most √8 times its value for an unrotated point, and there are no more terms than pixels in the window.
-    terms = 2.0 * np.sqrt(8.0) * size[0] * size[1]
+    terms = 2.0 * np.sqrt(8.0) * (2 * across + 1) * (2 * down + 1)
     sigmas = np.sqrt(2.0 * np.log(max(terms / reject_below, 1.0))) + 1e-6
     margins_m = sigmas * np.sqrt(noise[2, 2] + spread_m2)
-    image = np.array([fx, fy, cx + across, cy + down, *near_m.shape[::-1], widening])
+    height, width = near_m.shape
+    image = np.array([fx, fy, cx + across, cy + down, width, height, widening])
     return np.column_stack([own.points_m, margins_m]), near_m, image
+
+
+def _nearest_ranges(ranges_m: Array, reach_px: Array, device: str | None) -> np.ndarray:
+    if device is None:
+        return kernel.nearest_ranges(ranges_m, reach_px)
+    from modeler.kernels.gpu.paper import nearest_ranges
+
+    return nearest_ranges(ranges_m, reach_px, device)

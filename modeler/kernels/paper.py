@@ -20,6 +20,9 @@ SHIFT_30, SHIFT_27, SHIFT_31 = np.uint64(30), np.uint64(27), np.uint64(31)
 SHIFT_43, SHIFT_22, SHIFT_11, SHIFT_1 = np.uint64(43), np.uint64(22), np.uint64(11), np.uint64(1)
 LOW_21 = np.uint64((1 << 21) - 1)
 
+X, Y, Z, MARGIN, BACKWARD = range(5)
+"""Columns of a check: a surface point (3), its largest distance in front in m, and whether it is the target's."""
+
 
 @njit(cache=True)
 def ray_jacobian(point):
@@ -266,16 +269,22 @@ def forbidden(check, pose, near_m, image):
     """Return whether a check's point, transformed by a pose, lies in front of every measured pixel within its reach.
 
     Args:
-        check: (4,) a surface point (3) and its largest distance in front, in m.
-        pose: (12,) rows of the transform from its view to the other.
-        near_m: (h, w) float32 least range within reach of any point that rounds to a pixel of the other view.
+        check: (5,).
+        pose: (12,) rows of target_from_source.
+        near_m: (h, w) float32 `nearest_ranges` of the other view.
         image: (7,) fx, fy, cx, cy in px of a pixel of `near_m`; its width and height; and (r / z²)² up to which
             `near_m` is valid, in 1/m².
     """
-    px, py, pz, margin_m = check
-    x = pose[0] * px + pose[1] * py + pose[2] * pz + pose[3]
-    y = pose[4] * px + pose[5] * py + pose[6] * pz + pose[7]
-    z = pose[8] * px + pose[9] * py + pose[10] * pz + pose[11]
+    px, py, pz = check[X], check[Y], check[Z]
+    if check[BACKWARD] > 0.0:
+        px, py, pz = px - pose[3], py - pose[7], pz - pose[11]
+        x = pose[0] * px + pose[4] * py + pose[8] * pz
+        y = pose[1] * px + pose[5] * py + pose[9] * pz
+        z = pose[2] * px + pose[6] * py + pose[10] * pz
+    else:
+        x = pose[0] * px + pose[1] * py + pose[2] * pz + pose[3]
+        y = pose[4] * px + pose[5] * py + pose[6] * pz + pose[7]
+        z = pose[8] * px + pose[9] * py + pose[10] * pz + pose[11]
     if z <= 0.0:
         return True
     inverse = 1.0 / z
@@ -285,23 +294,39 @@ def forbidden(check, pose, near_m, image):
     column, row = image[0] * x * inverse + image[2] + 0.5, image[1] * y * inverse + image[3] + 0.5
     if not (0.0 <= column < image[4] and 0.0 <= row < image[5]):
         return True
-    free_m = near_m[int(row), int(column)] - margin_m
+    free_m = near_m[int(row), int(column)] - check[MARGIN]
     return free_m > 0.0 and square < free_m * free_m
 
 
-def passing(poses, checks, near_m, image):
-    """Return whether poses (m, 12) pass checks (n, 4), (m,); for the rest, see `forbidden`."""
-    return over_rows(_passing, poses, checks, near_m, image)
+@njit(cache=True, inline="always")
+def passes(pose, checks, near_m, images):
+    """Return whether no check forbids a pose."""
+    for j in range(checks.shape[0]):
+        if checks[j, BACKWARD] > 0.0:
+            if forbidden(checks[j], pose, near_m[1], images[1]):
+                return False
+        elif forbidden(checks[j], pose, near_m[0], images[0]):
+            return False
+    return True
+
+
+def passing(poses, checks, near_m, images):
+    """Return whether poses (m, 12) pass all checks, (m,).
+
+    Args:
+        poses: rows of target_from_source.
+        checks: (n, 5), the most selective first.
+        near_m: target's and source's `nearest_ranges`.
+        images: target's and source's image, see `forbidden`.
+    """
+    return over_rows(_passing, poses, checks, near_m, images)
 
 
 @njit(cache=True, nogil=True)
-def _passing(poses, checks, near_m, image):
-    result = np.ones(poses.shape[0], dtype=np.bool_)
+def _passing(poses, checks, near_m, images):
+    result = np.empty(poses.shape[0], dtype=np.bool_)
     for i in range(poses.shape[0]):
-        for j in range(checks.shape[0]):
-            if forbidden(checks[j], poses[i], near_m, image):
-                result[i] = False
-                break
+        result[i] = passes(poses[i], checks, near_m, images)
     return result
 
 
@@ -316,3 +341,51 @@ def _drawn(numbers, seed, limits):
     for i in range(numbers.shape[0]):
         draw(np.uint64(numbers[i]), seed, limits, poses[i])
     return poses
+
+
+@njit(cache=True)
+def verdicts(poses, checks, near_m, images):
+    """Return whether each check forbids each pose, (m, n); arguments as for `passing`."""
+    result = np.empty((poses.shape[0], checks.shape[0]), dtype=np.bool_)
+    for i in range(poses.shape[0]):
+        for j in range(checks.shape[0]):
+            side = 1 if checks[j, BACKWARD] > 0.0 else 0
+            result[i, j] = forbidden(checks[j], poses[i], near_m[side], images[side])
+    return result
+
+
+def nearest_ranges(ranges_m, reach_px):
+    """Return the least range (h + 2b, w + 2a) within reach of any point that rounds to a pixel, never rounded up.
+
+    The image is padded by the reach (a, b) in pixels; infinite if there is no measurement within reach.
+
+    Args:
+        ranges_m: (h, w) range of every pixel in m; 0 = no measurement, which excludes nothing.
+        reach_px: (2,) half axes of the ellipse within reach, along columns and rows.
+    """
+    across, down = math.ceil(reach_px[0] + 0.5), math.ceil(reach_px[1] + 0.5)
+    return over_rows(_nearest_ranges, np.arange(ranges_m.shape[0] + 2 * down), ranges_m, reach_px, across, down)
+
+
+@njit(cache=True, nogil=True)
+def _nearest_ranges(rows, ranges_m, reach_px, across, down):
+    height, width = ranges_m.shape
+    result = np.full((rows.shape[0], width + 2 * across), np.float32(np.inf))
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        for dy in range(-down, down + 1):
+            other = row - down + dy
+            if other < 0 or other >= height:
+                continue
+            # A point may be half a pixel from the one to which it rounds.
+            rest = 1.0 - (max(abs(dy) - 0.5, 0.0) / reach_px[1]) ** 2
+            if rest < 0.0:
+                continue
+            half = math.floor(reach_px[0] * math.sqrt(rest) + 0.5)
+            for dx in range(-half, half + 1):
+                for column in range(width):
+                    value = np.float32(ranges_m[other, column] * (1.0 - 1e-6))
+                    place = column + across - dx
+                    if value < result[i, place]:
+                        result[i, place] = value
+    return result

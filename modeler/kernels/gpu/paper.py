@@ -23,7 +23,7 @@ else:
 wp.set_module_options({"enable_backward": False})
 
 Pose = wp.types.vector(length=12, dtype=wp.float64)
-Check = wp.types.vector(length=4, dtype=wp.float64)
+Check = wp.types.vector(length=5, dtype=wp.float64)
 Image = wp.types.vector(length=7, dtype=wp.float64)
 
 STRIDE, GOLDEN = wp.constant(wp.uint64(int(twin.STRIDE))), wp.constant(wp.uint64(int(twin.GOLDEN)))
@@ -33,7 +33,7 @@ HALF, ONE, TWO = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0)), wp.
 ZERO, NEVER = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(-np.inf))
 TO_GRID, TO_UNIT = wp.constant(wp.float64(2.0**-20)), wp.constant(wp.float64(2.0**-53))
 HIDDEN, FREE = wp.constant(wp.float64(6.0)), wp.constant(wp.float64(-27.3))
-NO_REACH = wp.constant(wp.float64(1e6))
+NO_REACH, ROUNDED_DOWN = wp.constant(wp.float64(1e6)), wp.constant(wp.float64(1.0 - 1e-6))
 
 AT_ONCE = 1 << 24
 """Number of draws of one launch, which take 192 MB of device memory."""
@@ -70,12 +70,14 @@ class View:
 
 
 @wp.struct
-class Test:
-    """One side of `FreeSpace`."""
+class Tests:
+    """`FreeSpace`."""
 
     checks: wp.array[Check]
-    near_m: wp.array2d[wp.float32]
-    image: Image
+    near_target_m: wp.array2d[wp.float32]
+    near_source_m: wp.array2d[wp.float32]
+    of_target: Image
+    of_source: Image
 
 
 @wp.func
@@ -259,47 +261,47 @@ def draw(number: wp.uint64, seed: wp.uint64, limits: wp.array[wp.float64]) -> Po
 
 
 @wp.func
-def passes_one(rotation: wp.mat33d, shift_m: wp.vec3d, test: Test) -> wp.int32:
-    """Return 1 if no check of a side forbids a pose, else 0, see `twin.forbidden`."""
-    for j in range(test.checks.shape[0]):
-        check, image = test.checks[j], test.image
-        at = rotation * wp.vec3d(check[0], check[1], check[2]) + shift_m
-        if at[2] <= ZERO:
-            return 0
-        inverse, square = ONE / at[2], wp.dot(at, at)
-        if square * inverse * inverse * inverse * inverse <= image[6]:
-            column = image[0] * at[0] * inverse + image[2] + HALF
-            row = image[1] * at[1] * inverse + image[3] + HALF
-            if column < ZERO or column >= image[4] or row < ZERO or row >= image[5]:
-                return 0
-            free_m = wp.float64(test.near_m[wp.int32(row), wp.int32(column)]) - check[3]
-            if free_m > ZERO and square < free_m * free_m:
-                return 0
-    return 1
+def forbidden(at: wp.vec3d, margin_m: wp.float64, near_m: wp.array2d[wp.float32], image: Image) -> wp.bool:
+    """Return whether a point lies in front of every measured pixel within its reach, see `twin.forbidden`."""
+    if at[2] <= ZERO:
+        return True
+    inverse = ONE / at[2]
+    square = wp.dot(at, at)
+    if square * inverse * inverse * inverse * inverse > image[6]:
+        return False
+    column = image[0] * at[0] * inverse + image[2] + HALF
+    row = image[1] * at[1] * inverse + image[3] + HALF
+    if column < ZERO or column >= image[4] or row < ZERO or row >= image[5]:
+        return True
+    free_m = wp.float64(near_m[wp.int32(row), wp.int32(column)]) - margin_m
+    return free_m > ZERO and square < free_m * free_m
 
 
 @wp.func
-def passes(pose: Pose, forward: Test, backward: Test) -> wp.int32:
+def passes(pose: Pose, tests: Tests) -> wp.int32:
     """Return 1 if no check forbids a pose, else 0."""
     rotation, shift_m = rotation_of(pose), translation_of(pose)
-    if passes_one(rotation, shift_m, forward) == 0:
-        return 0
-    back = wp.transpose(rotation)
-    return passes_one(back, -(back * shift_m), backward)
+    for j in range(tests.checks.shape[0]):
+        check = tests.checks[j]
+        point = wp.vec3d(check[0], check[1], check[2])
+        wrong = wp.bool(False)
+        if check[4] > ZERO:
+            at = wp.transpose(rotation) * (point - shift_m)
+            wrong = forbidden(at, check[3], tests.near_source_m, tests.of_source)
+        else:
+            wrong = forbidden(rotation * point + shift_m, check[3], tests.near_target_m, tests.of_target)
+        if wrong:
+            return 0
+    return 1
 
 
 @wp.kernel
 def sift_draws(
-    first: wp.uint64,
-    seed: wp.uint64,
-    limits: wp.array[wp.float64],
-    forward: Test,
-    backward: Test,
-    passing: wp.array[wp.int32],
+    first: wp.uint64, seed: wp.uint64, limits: wp.array[wp.float64], tests: Tests, passing: wp.array[wp.int32]
 ):
     """Write whether each of the draws numbered from `first` passes."""
     i = wp.tid()
-    passing[i] = passes(draw(first + wp.uint64(i), seed, limits), forward, backward)
+    passing[i] = passes(draw(first + wp.uint64(i), seed, limits), tests)
 
 
 @wp.kernel
@@ -320,10 +322,46 @@ def keep_draws(
 
 
 @wp.kernel
-def sift(poses: wp.array[Pose], forward: Test, backward: Test, passing: wp.array[wp.int32]):
+def sift(poses: wp.array[Pose], tests: Tests, passing: wp.array[wp.int32]):
     """Write whether each pose passes."""
     i = wp.tid()
-    passing[i] = passes(poses[i], forward, backward)
+    passing[i] = passes(poses[i], tests)
+
+
+@wp.kernel
+def find_nearest(
+    ranges_m: wp.array2d[wp.float64],
+    reach_px: wp.vec2d,
+    across: wp.int32,
+    down: wp.int32,
+    near_m: wp.array2d[wp.float32],
+):
+    """Write the least range within reach of any point that rounds to a pixel, see `twin.nearest_ranges`."""
+    row, column = wp.tid()
+    least = wp.float32(wp.inf)
+    for dy in range(-down, down + 1):
+        other = row - down + dy
+        rest = wp.max(wp.float64(wp.abs(dy)) - HALF, ZERO) / reach_px[1]
+        rest = ONE - rest * rest
+        if other >= 0 and other < ranges_m.shape[0] and rest >= ZERO:
+            half = wp.int32(wp.floor(reach_px[0] * wp.sqrt(rest) + HALF))
+            for there in range(
+                wp.max(column - across - half, 0), wp.min(column - across + half + 1, ranges_m.shape[1])
+            ):
+                least = wp.min(least, wp.float32(ranges_m[other, there] * ROUNDED_DOWN))
+    near_m[row, column] = least
+
+
+def nearest_ranges(
+    ranges_m: npt.NDArray[np.float64], reach_px: npt.NDArray[np.float64], device: str
+) -> npt.NDArray[np.float32]:
+    """Return the result of `paper.nearest_ranges`."""
+    across, down = (int(np.ceil(reach + 0.5)) for reach in reach_px)
+    shape = ranges_m.shape[0] + 2 * down, ranges_m.shape[1] + 2 * across
+    near_m = wp.empty(shape, dtype=wp.float32, device=device)
+    inputs = [sent(ranges_m, device), wp.vec2d(*reach_px), across, down]
+    wp.launch(find_nearest, dim=shape, inputs=inputs, outputs=[near_m], device=device)
+    return near_m.numpy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,8 +373,7 @@ class OnDevice:
     source: Any
     """`View`s; their points and ranges are copied once."""
     target: Any
-    tests: tuple[Any, Any]
-    """Both sides, `Test`s."""
+    tests: Any
     options: tuple[float, float]
     """As for `paper.log_likelihoods`."""
 
@@ -344,7 +381,7 @@ class OnDevice:
     def of(
         device: str,
         views: Sequence[tuple[np.ndarray, ...]],
-        tests: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+        tests: tuple[np.ndarray, tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
         options: tuple[float, float],
     ) -> "OnDevice":
         """Return source and target, each points (n, 3), ranges, intrinsics and noise, and a test, on a device.
@@ -352,12 +389,16 @@ class OnDevice:
         Args:
             device: name of the Warp device.
             views: source and target.
-            tests: checks, least ranges and image, as for `paper.passing`, of source in target and of target in source.
+            tests: checks, nearest ranges and images, as for `paper.passing`.
             options: as for `paper.log_likelihoods`.
         """
+        checks, near_m, images = tests
+        sifter = Tests()
+        sifter.checks = sent(np.ascontiguousarray(checks), device, Check)
+        sifter.near_target_m, sifter.near_source_m = (sent(near, device) for near in near_m)
+        sifter.of_target, sifter.of_source = (Image(*image) for image in images)
         source, target = (_view(view, device) for view in views)
-        forward, backward = (_test(test, device) for test in tests)
-        return OnDevice(device, source, target, (forward, backward), options)
+        return OnDevice(device, source, target, sifter, options)
 
     def weighted_draws(
         self, count: int, seed: np.uint64, limits: npt.NDArray[np.float64]
@@ -368,7 +409,7 @@ class OnDevice:
         for first in range(0, count, AT_ONCE):
             tried = min(AT_ONCE, count - first)
             numbers = [wp.uint64(first), wp.uint64(int(seed)), on_device]
-            wp.launch(sift_draws, dim=tried, inputs=[*numbers, *self.tests], outputs=[passing], device=self.device)
+            wp.launch(sift_draws, dim=tried, inputs=[*numbers, self.tests], outputs=[passing], device=self.device)
             wp.utils.array_scan(passing[:tried], passing[:tried], inclusive=True)
             kept = wp.empty(int(passing[tried - 1 : tried].numpy()[0]), dtype=Pose, device=self.device)
             wp.launch(keep_draws, dim=tried, inputs=[*numbers, passing], outputs=[kept], device=self.device)
@@ -378,7 +419,7 @@ class OnDevice:
         """Return the poses (k, 12) of (m, 12) that are not rejected, and their log-likelihoods (k,)."""
         passing = wp.empty(len(poses), dtype=wp.int32, device=self.device)
         on_device = wp.array(np.ascontiguousarray(poses), dtype=Pose, device=self.device)
-        wp.launch(sift, dim=len(poses), inputs=[on_device, *self.tests], outputs=[passing], device=self.device)
+        wp.launch(sift, dim=len(poses), inputs=[on_device, self.tests], outputs=[passing], device=self.device)
         kept = poses[passing.numpy() > 0]
         return self._weighted(wp.array(np.ascontiguousarray(kept), dtype=Pose, device=self.device))
 
@@ -404,13 +445,4 @@ def _view(view: tuple[np.ndarray, ...], device: str) -> Any:
     result = View()
     result.points_m, result.ranges_m = sent(np.ascontiguousarray(points_m), device, wp.vec3d), sent(ranges_m, device)
     result.intrinsics, result.noise = wp.vec4d(*intrinsics), wp.mat33d(*noise.ravel())
-    return result
-
-
-def _test(test: tuple[np.ndarray, np.ndarray, np.ndarray], device: str) -> Any:
-    """Return checks, least ranges and image of a side on a device."""
-    checks, near_m, image = test
-    result = Test()
-    result.checks, result.near_m = sent(np.ascontiguousarray(checks), device, Check), sent(near_m, device)
-    result.image = Image(*image)
     return result
