@@ -138,8 +138,9 @@ def remasked(prepared: Prepared, mask: BoolArray, sensor: Sensor) -> Prepared:
 
 
 def contradicting(state: State) -> list[Edge]:
-    """Return edges of the refinement that determine a motion and contradict the poses."""
-    return [edge for edge in state.spans if isinstance(edge.reason, Consistency) and not edge.accepted]
+    """Return edges of the refinement that determine a motion and contradict the poses, if they are several."""
+    found = [edge for edge in state.spans if isinstance(edge.reason, Consistency) and not edge.accepted]
+    return found if len(found) >= MIN_JOINS else []  # fewer may match by chance
 
 
 def most_crossed(state: State, edges: Sequence[Edge]) -> tuple[int, int]:
@@ -185,8 +186,8 @@ class Realigner:
 
     def contradictions(self, state: State) -> tuple[float, int]:
         """Return free-space violations in units of their limit, 1 within it, and the number of contradicting spans."""
-        free, spans = self.free_space(state), len(contradicting(state))
-        return (1.0 if free is None else max(free.excess, 1.0)), (spans if spans >= MIN_JOINS else 0)
+        free = self.free_space(state)
+        return (1.0 if free is None else max(free.excess, 1.0)), len(contradicting(state))
 
     def _gap(self, state: State) -> tuple[int, int] | None:
         """Return the two successive views across which most is contradicted; None if all holds."""
@@ -194,7 +195,7 @@ class Realigner:
         if free is not None and not free.holds:
             return self._most_contradicted(state, free)
         spans = contradicting(state)
-        return most_crossed(state, spans) if len(spans) >= MIN_JOINS else None
+        return most_crossed(state, spans) if spans else None
 
     def free_space(self, state: State, among: Iterable[int] | None = None) -> FreeSpace | None:
         """Return the free-space violations between views of a state, by default all, as the verdict judges them."""

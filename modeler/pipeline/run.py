@@ -19,6 +19,7 @@ from modeler.pipeline.correcting import (
     LEAST_TURN_DEG,
     MAX_ROUNDS,
     Realigner,
+    contradicting,
     joined,
     masks_of,
     moving_along,
@@ -179,6 +180,8 @@ class Run:
         free = realigner.free_space(self.state)
         if free is not None and not free.holds and self.scene.finds_masks:
             before, free = yield from self._remasked(realigner, before, free)
+        if (free is None or free.holds) and not contradicting(self.state):
+            return
         realigned = yield from realigner.realigned(before)
         if realigned is before:
             return
