@@ -187,6 +187,16 @@ def test_equations_of_features_are_those_of_planes_with_their_gradient(printed):
     np.testing.assert_allclose(matrices_of[0, 1], want[1], rtol=0.02, atol=0.02 * abs(want[1]).max())
 
 
+def test_noise_of_normals_does_not_seem_to_tell_how_a_ball_turns(printed):
+    views, truth = printed
+    pair = VisibilityLikelihood(colour=False).between(views[0], views[1], np.random.default_rng(0))
+    extent, blur_m = np.repeat([1.0, pair.size_m], 3), 0.06 * pair.size_m
+    by_both = np.linalg.eigvalsh(pair.sensitivity(truth, blur_m) * np.outer(extent, extent))
+    by_mean = np.linalg.eigvalsh(pair.curvatures(truth[None], blur_m, stride=1)[0] * np.outer(extent, extent))
+    np.testing.assert_allclose(by_both[3:], by_mean[3:], rtol=0.02)
+    assert np.all(np.abs(by_both[:3]) < 0.5 * by_mean[:3])
+
+
 def registered(views: Views, *, colour: bool, seed: int = 0) -> Posterior:
     registrar = VisibilityRegistrar(VisibilityLikelihood(colour=colour))
     density = TablePrior().between(*views)

@@ -136,9 +136,7 @@ def equations(pose, surfaces, colours, weight, centre, surface_m, workspace, gra
             continue
         else:
             fetch_colours(count, pixels, features, colour)
-            linearise_features(
-                surface.points, features.values, transformed, found, colour, about, surface_m2, weight, rows
-            )
+            linearise_features(features.values, transformed, colour, about, weight, rows)
         accumulate(rows, count, part, block)
         if kind == 0:
             for k in range(6):

@@ -231,18 +231,16 @@ def sum_moments(points, values, transformed, looked_up, seen, surface_m2):
 
 
 @njit(cache=True, error_model="numpy", fastmath=VECTOR_MATHS, forceinline=True)
-def linearise_features(points, values, transformed, found, colour, centre, surface_m2, weight, rows):
-    """Write the equations of features into `rows` (8, n): derivatives by ζ, residual and weight.
+def linearise_features(values, transformed, colour, centre, weight, rows):
+    """Replace the equations of matches in `rows` (9, n), see `point_to_plane.linearise`, by those of their features.
 
     A feature is linear in the point's position, like a plane's distance, with its gradient in place of the normal.
     """
     cx, cy, cz = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2])
-    for j in range(points.shape[1]):
-        distance = plane_distance(transformed, found, j)
-        matched = match_weight(points, transformed, found, distance, surface_m2, j) > ZERO
+    for j in range(values.shape[0]):
         rows[6, j] = plane_distance(transformed, colour, j) - values[j]
-        rows[7, j] = weight * transformed[FACING, j] if matched else ZERO
-    for j in range(points.shape[1]):
+        rows[7, j] = weight * transformed[FACING, j] if rows[7, j] > ZERO else ZERO
+    for j in range(values.shape[0]):
         x, y, z = transformed[X, j] - cx, transformed[Y, j] - cy, transformed[Z, j] - cz
         slope_x, slope_y, slope_z = colour[GRADIENT_X, j], colour[GRADIENT_Y, j], colour[GRADIENT_Z, j]
         rows[0, j] = y * slope_z - z * slope_y

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from modeler import se3
-from modeler.kernels import gauss_newton, point_likelihood, scores
+from modeler.kernels import gauss_newton, point_likelihood, point_to_plane, scores
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import Projection
@@ -20,6 +20,7 @@ from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour,
 from modeler.registration.visibility.points import (
     FixedPattern,
     IntArray,
+    by_motion,
     points_of,
     significant_variances,
     spread_points,
@@ -366,9 +367,23 @@ class PairLikelihood:
         shifts = np.linalg.solve(spread, self.colour.shifts(pose))
         return np.asarray(spread @ (axes * np.clip(shares, 0.0, 1.0)) @ axes.T @ shifts, dtype=np.float64)
 
-    def surface_curvature(self, pose: Array, blur_m: float) -> Array:
-        """Return the curvature (6, 6) of the surface's part of `tempered` by ξ about the centre, at a pose (4, 4)."""
-        return self._curvatures(pose[None], blur_m, 1)[0][0]
+    def sensitivity(self, pose: Array, blur_m: float) -> Array:
+        """Return the sensitivity J (6, 6) of matching surface to ξ about the centre, at a pose (4, 4), tempered.
+
+        Products of either surface's normals: the noise of normals, which seems to tell how a ball turns, averages out
+        (method, eq. 6.1).
+        """
+        found = np.zeros((6, 6))
+        for directed, transform in ((self.forward, pose), (self.backward, se3.inverse(pose))):
+            matches = directed.matches(rows(transform), blur_m)
+            to_source = np.eye(4) if directed is self.backward else se3.inverse(pose)
+            arms = se3.transform(to_source, matches[:, point_to_plane.POSITION]) - self.centre_m
+            own, other = (
+                by_motion(arms, matches[:, normal] @ to_source[:3, :3].T)
+                for normal in (point_to_plane.OWN, point_to_plane.OTHER)
+            )
+            found += (own.T * matches[:, point_to_plane.WEIGHT]) @ other
+        return 0.5 * self.temper * (found + found.T)
 
     def _curvatures(self, poses: Array, blur_m: float, stride: int) -> tuple[Array, Array]:
         """Return the parts (n, 6, 6) of `curvatures`: of surface, and of colours."""

@@ -52,6 +52,12 @@ def point_rows(
     return np.hstack([points_m, normals, variances_m2[:, None], pixels, rims[:, None]])
 
 
+def by_motion(arms: Array, slopes: Array) -> Array:
+    """Return derivatives (n, 6) by ξ from derivatives (n, 3) by the positions (n, 3) of points about the centre."""
+    (x, y, z), (a, b, c) = arms.T, slopes.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
+
+
 _SIGNIFICANT = 2.0  # standard errors above which errors near silhouettes are part of the model
 
 

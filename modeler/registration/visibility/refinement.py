@@ -19,7 +19,7 @@ from modeler.registration.posterior import FLOOR, KNOWN, FocalNuisance
 from modeler.registration.visibility.directed import DirectedLikelihood
 from modeler.registration.visibility.likelihood import MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
-from modeler.registration.visibility.points import OWN_RIM, FixedPattern, IntArray
+from modeler.registration.visibility.points import OWN_RIM, FixedPattern, IntArray, by_motion
 from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
 from modeler.types import Array, Camera
@@ -282,7 +282,7 @@ def _equations(pair: PairLikelihood, pose: Array, noise: MatchNoise) -> tuple[Eq
         for part, used, pattern in zip(parts, (surface, colours), (directed.pattern, FixedPattern()), strict=True):
             at = arms[: len(used)]  # all or none
             own, other = (used[:, k] @ to_source[:3, :3].T for k in (point_to_plane.OWN, point_to_plane.OTHER))
-            derivatives = [sign * _by_motion(at, normals) for normals in (own, other)]
+            derivatives = [sign * by_motion(at, normals) for normals in (own, other)]
             residuals, weights = used[:, point_to_plane.RESIDUAL], used[:, point_to_plane.WEIGHT]
             slopes, curvature = _pattern_derivatives(pattern, used, at, to_source[:3, :3], directed.image.frame.camera)
             part.append((at, *derivatives, residuals, weights, sign * slopes, curvature))
@@ -309,18 +309,12 @@ def _pattern_derivatives(
     slopes, curvatures = pattern.derivatives(used, camera)
     slopes, jacobians = slopes @ to_source.T, _position_jacobians(arms) @ to_source
     curvature = np.einsum("nil,njl->ij", jacobians @ curvatures, jacobians)[None]
-    return _by_motion(arms, slopes), np.asarray(curvature, dtype=np.float64)
+    return by_motion(arms, slopes), np.asarray(curvature, dtype=np.float64)
 
 
 def _products(rows: Array, factors: Array) -> Array:
     """Return the sum (k,) of rows (n, k) times factors (n,), without BLAS, whose threads would stay awake for long."""
     return np.asarray(np.einsum("nk,n->k", rows, factors), dtype=np.float64)
-
-
-def _by_motion(arms: Array, slopes: Array) -> Array:
-    """Return derivatives (n, 6) by ξ from derivatives (n, 3) by the positions (n, 3) of points about the centre."""
-    (x, y, z), (a, b, c) = arms.T, slopes.T
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
 
 
 def _position_jacobians(arms: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 _STRIDE = 2  # every second point is used for scores
 _COARSE_STRIDE = 8  # where the best pose need only be roughly right
-_SILENT = 0.1  # of the largest curvature: that of balls is 0.03, by the noise of normals
+_OPEN = 0.5  # sd in basins from which on prior and surface leave a motion open: descents reach no farther
 OPEN_ROTATION_RAD = 1.0
 """Standard deviation of an open rotation: it is 1.33 if all are equally likely, 1.0 within limits of 130°."""
 
@@ -180,23 +181,25 @@ class Search:
     ) -> tuple[Array, Array]:
         """Return starting poses (n, 4, 4), and the poses (n, 4, 4) after descent from them."""
         regulariser = self._regulariser(pair, prior)
+        *coarse_m, fine_m = self.blurs_m(pair)
 
-        def descended(poses: Array) -> Array:
-            for blur_m in self.blurs_m(pair):
+        def descended(pair: PairLikelihood, poses: Array, blurs_m: Sequence[float]) -> Array:
+            for blur_m in blurs_m:
                 poses = pair.descend(poses, blur_m, regulariser, steps=self.steps)
             return poses
 
         if near is not None:
-            return near[None], descended(near[None])
+            return near[None], descended(pair, near[None], [*coarse_m, fine_m])
         wanted = self.starts(pair, prior)
         started = self._drawn(pair, density, min(wanted, self.max_starts), rng)
         if wanted > self.max_starts:
             started = np.concatenate([started, self._from_features(pair, density)])
-        poses = descended(started)
+        poses = descended(replace(pair, colour=None), started, coarse_m)
         turned = self._by_colour(pair, density, prior, poses, rng)
-        if not len(turned):
-            return started, poses
-        return np.concatenate([started, turned]), np.concatenate([poses, descended(turned)])
+        if len(turned):  # colours decide
+            started = np.concatenate([started, turned])
+            poses = descended(pair, started, coarse_m)
+        return started, descended(pair, poses, [fine_m])
 
     def _by_colour(
         self,
@@ -211,31 +214,39 @@ class Search:
         Surface leads to one of the poses that it cannot distinguish, such as those of a ball; few of these have
         colours within reach of a descent. Moves along them keep matching surface, so that many can be compared.
         """
-        coarse_m = float(self.blurs_m(pair)[0])
         if pair.colour is None:
             return poses[:0]
-        best = poses[np.argmax(pair.tempered(poses, self.fine_m(pair), stride=_COARSE_STRIDE))]
-        extent = self.extent(pair)
-        scales, axes = np.linalg.eigh(pair.surface_curvature(best, coarse_m) * np.outer(extent, extent))
-        silent = axes[:, scales < _SILENT * scales[-1]]
-        if not silent.shape[1]:
+        coarse_m, surface = float(self.blurs_m(pair)[0]), replace(pair, colour=None)
+        best = poses[np.argmax(surface.tempered(poses, self.fine_m(pair), stride=_COARSE_STRIDE))]
+        open_motions = self._open_motions(pair, prior, best, coarse_m)
+        dimensions = open_motions.shape[1]
+        if not dimensions:
             return poses[:0]
-        spread = np.linalg.cholesky(silent.T @ (prior.covariance / np.outer(extent, extent)) @ silent)
-        count = max(round(self.turns ** (min(len(spread), 3) / 3.0)), self.min_starts)  # as far apart as on a ball
-        moves = rng.normal(size=(count, len(spread))) @ (silent @ spread).T * extent
+        count = max(round(self.turns ** (min(dimensions, 3) / 3.0)), self.min_starts)  # as far apart as on a ball
+        moves = rng.normal(size=(count, dimensions)) @ open_motions.T
         moved = se3.moved(np.broadcast_to(best, (count, 4, 4)), moves, pair.centre_m)
         moved = moved[np.isfinite(density.log_prior(moved))]
         colours = pair.scores(moved, coarse_m, stride=_COARSE_STRIDE).colours if len(moved) else np.zeros(0)
         return moved[np.argsort(-colours, kind="stable")[: self.min_starts]]
 
+    def _open_motions(self, pair: PairLikelihood, prior: PoseGaussian, pose: Array, blur_m: float) -> Array:
+        """Return motions ξ (6, k) that prior and surface leave open at a pose (4, 4), by one sd of the prior."""
+        extent = self.extent(pair)
+        covariance = prior.covariance / np.outer(extent, extent)
+        levels, axes = np.linalg.eigh(pair.sensitivity(pose, blur_m) * np.outer(extent, extent))
+        precision = (axes * np.maximum(levels, 0.0)) @ axes.T + np.linalg.inv(covariance)
+        variances, axes = np.linalg.eigh(np.linalg.inv(precision))
+        open_axes = axes[:, variances > _OPEN**2]
+        root = np.linalg.cholesky(open_axes.T @ covariance @ open_axes)
+        return np.asarray(extent[:, None] * (open_axes @ root), dtype=np.float64)
+
     def _drawn(self, pair: PairLikelihood, density: AbstractPoseDensity, count: int, rng: np.random.Generator) -> Array:
         """Return starting poses (n, 4, 4): samples of the prior that match best at twice the coarsest blur."""
         poses, blur = density.sample(self.proposals * count, rng), self.finest * 2.0**self.stages
-        found = pair.scores(poses, blur * pair.size_m, stride=_COARSE_STRIDE)
+        found = replace(pair, colour=None).scores(poses, blur * pair.size_m, stride=_COARSE_STRIDE)
         # A coarse match determines the depth less well than a fine one: each has the weight -log(blur / size).
         matches = np.log(blur) * found.explained * pair.points
-        scores = found.surface - matches + found.colours / pair.temper
-        return poses[np.argsort(-scores, kind="stable")[:count]]
+        return poses[np.argsort(matches - found.surface, kind="stable")[:count]]
 
     def _from_features(self, pair: PairLikelihood, density: AbstractPoseDensity) -> Array:
         """Return starting poses (n, 4, 4) from feature matches, no two in a basin, those with most matches first."""
