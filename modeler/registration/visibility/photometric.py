@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -29,7 +28,7 @@ VALUE, BY_COLUMN, BY_ROW = 0, 1, 2
 
 _BLACK = 4.0  # added to 8-bit values: below it, noise and rounding would dominate their logarithm
 _LOGS = (np.log(np.arange(256) + _BLACK) / 3.0).astype(np.float32)  # a third for each of three 8-bit channels
-_ALIGNMENT_BAND = 2  # by which images are aligned: a tin's print moves by more than its width
+_COARSEST_ALIGNMENT = 2  # band in which images are first aligned: a tin's print moves by more than its width
 _SHADING_POINTS = 2000  # of a view, to estimate its shading
 _EDGE_SIGMAS = 3.0  # change of shading at an edge, in standard deviations of the noise of normals
 _NORMAL_QUARTILE = 0.6745  # median magnitude of a standard normal variable
@@ -52,6 +51,7 @@ class PairColour:
     """(n,) indices of the source's surface points to compare."""
     target_points: np.ndarray
     """(m,) of the target's."""
+    _shifts_px: dict[int, Array] = field(default_factory=dict)
     _static_correlations: dict[int, float] = field(default_factory=dict)
     _residuals: dict[int, tuple[_Features, _Features]] = field(default_factory=dict)
     _by_stride: dict[tuple[int, int], tuple[Colours, Colours]] = field(default_factory=dict)
@@ -138,11 +138,11 @@ class PairColour:
     def _regressed(self, band: int) -> tuple[_Features, _Features]:
         """Return the features of all points of source and target in a band, without static ones (eq. 7.2)."""
         if band not in self._residuals:
-            forward, backward = self._partners
             share = max(self.static_correlation(band), 0.0)
+            shift_px = self._static_shift_px(band) if share > 0.0 else np.zeros(2)
             self._residuals[band] = (
-                _regressed(self.source, self.target, forward, band, share),
-                _regressed(self.target, self.source, backward, band, share),
+                _regressed(self.source, self.target, shift_px, band, share),
+                _regressed(self.target, self.source, -shift_px, band, share),
             )
         return self._residuals[band]
 
@@ -160,17 +160,20 @@ class PairColour:
         if self.source.rendered or self.target.rendered:
             return 0.0
         if band not in self._static_correlations:
-            own, others = (view_features(view)[band] for view in (self.source, self.target))
-            subset = _subset(own.shape[1])
-            partners = (part[subset] for part in self._partners[0])
-            (own_square, product, square), _, _ = photometric.compare_in_place(own[:, subset], others, *partners)
-            self._static_correlations[band] = product / max(math.sqrt(own_square * square), 1e-12)
+            moments, _, _ = _in_place(self.source, self.target, band, self._static_shift_px(band))
+            self._static_correlations[band] = _correlation(moments)
         return self._static_correlations[band]
 
-    @cached_property
-    def _partners(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """For each point of the source, the same place in the target, and vice versa; see `_aligned`."""
-        return _aligned(self.source, self.target), _aligned(self.target, self.source)
+    def _static_shift_px(self, band: int) -> Array:
+        """Return columns and rows (2,) by which static features of the target lie from the source's, besides centroids.
+
+        Errors of centroids exceed the width of the finest bands: from `_COARSEST_ALIGNMENT` on, a step in each band.
+        """
+        band = min(band, _COARSEST_ALIGNMENT)
+        if band not in self._shifts_px:
+            coarse_px = np.zeros(2) if band == _COARSEST_ALIGNMENT else self._static_shift_px(band + 1)
+            self._shifts_px[band] = _aligned(self.source, self.target, band, coarse_px)
+        return self._shifts_px[band]
 
 
 class _Features(NamedTuple):
@@ -205,19 +208,30 @@ def weight_of(correlation: float) -> float:
     return square / (1.0 - square)
 
 
-def _aligned(view: RayImage, other: RayImage) -> tuple[np.ndarray, np.ndarray]:
-    """Return the partners of a view's points in the other, see `_partners`, after aligning the two images.
+def _aligned(view: RayImage, other: RayImage, band: int, shift_px: Array) -> Array:
+    """Return a shift (2,) at which features in place agree better, or the same: one step of least squares.
 
-    Errors of centroids exceed the width of the finest bands. One step of least squares (Lucas and Kanade 1981).
+    The step is that of Lucas and Kanade (1981).
     """
-    subset = _subset(len(view.points_m))
-    own, others = view_features(view)[_ALIGNMENT_BAND], view_features(other)[_ALIGNMENT_BAND]
-    partners = _partners(view.points_m[subset], view, other, np.zeros(2))
-    _, matrix, gradient = photometric.compare_in_place(own[:, subset], others, *partners)
+    moments, matrix, gradient = _in_place(view, other, band, shift_px)
     step = np.linalg.lstsq(matrix, gradient, rcond=None)[0]
-    width_px = FINEST_PX * 2**_ALIGNMENT_BAND  # farther features are not linear
-    shift_px = step * min(1.0, width_px / max(float(np.linalg.norm(step)), 1e-12))
-    return _partners(view.points_m, view, other, shift_px)
+    width_px = FINEST_PX * 2**band  # farther features are not linear
+    moved_px = shift_px + step * min(1.0, width_px / max(float(np.linalg.norm(step)), 1e-12))
+    agrees_better = _correlation(_in_place(view, other, band, moved_px)[0]) > _correlation(moments)
+    return moved_px if agrees_better else shift_px
+
+
+def _in_place(view: RayImage, other: RayImage, band: int, shift_px: Array) -> tuple[Array, Array, Array]:
+    """Return the sums of `photometric.compare_in_place` over a subset of a view's points."""
+    own, others = view_features(view)[band], view_features(other)[band]
+    subset = _subset(own.shape[1])
+    partners = _partners(view.points_m[subset], view, other, shift_px)
+    return photometric.compare_in_place(own[:, subset], others, *partners)
+
+
+def _correlation(moments: Array) -> float:
+    """Return the correlation of features from their second moments (3,): own, mixed, and other."""
+    return float(moments[1] / max(math.sqrt(moments[0] * moments[2]), 1e-12))
 
 
 def _subset(count: int) -> slice:
@@ -247,15 +261,19 @@ def _partners(points_m: Array, view: RayImage, other: RayImage, shift_px: np.nda
     return found, offsets
 
 
-def _regressed(
-    view: RayImage, other: RayImage, partners: tuple[np.ndarray, np.ndarray], band: int, share: float
-) -> _Features:
+def _no_partners(view: RayImage, other: RayImage) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `_partners` does if no point of a view falls on the other's surface."""
+    count = len(view.points_m)
+    return np.full(count, len(other.pixels), dtype=np.int32), np.zeros((count, 2), dtype=np.float32)
+
+
+def _regressed(view: RayImage, other: RayImage, shift_px: Array, band: int, share: float) -> _Features:
     """Return a view's features in a band, regressed on the other view's at the same places (eq. 7.2).
 
     Args:
         view: the view.
         other: the other view.
-        partners: of the view's points in the other view, see `_partners`.
+        shift_px: (2,) columns and rows, in addition to the shift of the centroids.
         band: index of the band.
         share: regression coefficient.
     """
@@ -266,6 +284,7 @@ def _regressed(
     )
     focal = np.array([camera.fx, camera.fy], dtype=np.float32)
     others = view_features(other)[band]
+    partners = _partners(view.points_m, view, other, shift_px) if share > 0.0 else _no_partners(view, other)
     photometric.remove_static(features, others, *partners, np.float32(share), view.points_m, focal, *residual)
     return residual
 
