@@ -20,6 +20,8 @@ from closure_runs import (
 
 from modeler import se3
 from modeler.closure import Closer, MapView
+from modeler.graph import PoseGraph, Smoother
+from modeler.pipeline.state import State
 from modeler.types import (
     Array,
     ConfirmedBy,
@@ -27,6 +29,7 @@ from modeler.types import (
     Degenerate,
     Failed,
     JoinsPrevious,
+    LowCorrelation,
     LowLikelihood,
     Mode,
     NotPlaced,
@@ -250,6 +253,45 @@ def test_scattered_or_missing_evidence_rejects_nothing() -> None:
     for spoil in (stated(13, scatter=15.0), lambda posterior: witnessed(posterior, np.nan)):
         run = Run(list(REGULAR_DEG)).run(Closer(), spoil)
         assert all(edge.accepted for edge in run.judged[13])
+
+
+@pytest.mark.parametrize(
+    ("usual", "step_deg", "correlation", "colours", "refused"),
+    [
+        (0.8, 25.0, 0.05, 80.0, True),
+        (0.8, 25.0, -0.4, 80.0, True),
+        (0.8, 25.0, 0.35, 80.0, False),  # right ones have as little in other light or seen obliquely
+        (0.8, 25.0, 0.05, 5.0, False),  # nor do a few colours tell
+        (0.4, 25.0, 0.0, 80.0, False),  # where print agrees hardly anywhere
+        (0.8, 3.0, 0.0, 80.0, False),  # or stays where it was, as highlights do
+        (np.nan, 25.0, 0.0, 80.0, False),
+    ],
+)
+def test_registrations_whose_print_disagrees_are_refused(
+    usual: float, step_deg: float, correlation: float, colours: float, refused: bool
+) -> None:
+    def printed(posterior: Posterior) -> Posterior:
+        found = correlation if posterior.source == 6 else usual
+        return replace(posterior, colour_correlation=found, independent_colours=colours)
+
+    run = Run([step_deg * k for k in range(9)]).run(Closer(), printed)
+    assert all(isinstance(edge.reason, LowCorrelation) for edge in run.judged[6]) is refused
+    assert (6 in run.views) is not refused
+    assert {7, 8} <= set(run.views)
+
+
+def test_what_was_found_of_a_frame_before_it_was_placed_is_judged_in_the_end() -> None:
+    run = Run(list(REGULAR_DEG)).run(Closer())
+    refused = [replace(edge, accepted=False, reason=NotPlaced()) for edge in run.closures()]
+    wrong = replace(refused[0].posterior, pose=PoseGaussian(turned(90.0), COVARIANCE))
+    edges = [edge for edge in run.graph.edges if edge.kind != "closure"]
+    for early, accepted in ((refused, True), ([replace(refused[0], posterior=wrong)], False)):
+        graph = PoseGraph((*early, *edges), first=0)
+        state = State(graph, Smoother().to(graph), run.views, run.keyframes)
+        found = state.rejudged(Closer().judge_span)
+        assert [edge.accepted for edge in found.graph.edges[-len(early) :]] == [accepted] * len(early)
+        assert [edge for edge in found.graph.edges if edge in edges] == edges
+    assert replace(state, graph=run.graph).rejudged(Closer().judge_span).graph is run.graph
 
 
 def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:

@@ -202,14 +202,14 @@ def test_median_evidence_is_that_of_edges_that_take_part() -> None:
     good = [of_evidence(edge(k, k + 1, SURE), 100.0) for k in range(5)]
     lying = [of_evidence(edge(k, k + 1, SURE), -1000.0) for k in range(7)]
     left_out = Solution(outliers=tuple(lying))
-    assert Thresholds().likelihood_bound([*good, *lying], left_out).median_nats == 100.0
-    assert not np.isfinite(Thresholds().likelihood_bound(lying, left_out).median_nats)
+    assert Thresholds().usual([*good, *lying], left_out).median_nats == 100.0
+    assert not np.isfinite(Thresholds().usual(lying, left_out).median_nats)
 
 
 def test_spans_do_not_count_for_the_median_evidence_between_neighbours() -> None:
     good = [of_evidence(edge(k, k + 1, SURE), 100.0) for k in range(5)]
     wide = [of_evidence(edge(k, k + 2, SURE, "span"), 50.0) for k in range(9)]
-    assert Thresholds().likelihood_bound([*good, *wide], Solution()).median_nats == 100.0
+    assert Thresholds().usual([*good, *wide], Solution()).median_nats == 100.0
 
 
 def test_a_turntable_learns_nothing_from_edges_that_were_left_out() -> None:

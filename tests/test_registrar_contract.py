@@ -21,6 +21,7 @@ from modeler.types import (
     Posterior,
     RayImage,
     SensorNoise,
+    ViewPair,
 )
 from modeler.views import Sensor
 
@@ -119,6 +120,13 @@ def test_does_not_move_identical_views(method: AbstractRegistrar) -> None:
 @every_method
 def test_swapping_the_views_inverts_the_motion(method: AbstractRegistrar) -> None:
     assert_close(method, se3.inverse(registered(method, 1, 0).pose.mean), registered(method, 0, 1).pose.mean)
+
+
+def test_a_known_mode_that_the_prior_excludes_is_at_its_limit() -> None:
+    source, target = view(0), view(1)
+    away = se3.moved(POSES[1] @ se3.inverse(POSES[0]), np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]), source.centroid_m)
+    pair = ViewPair(source, target, PRIOR.between(source, target), np.random.default_rng(5), near=away)
+    assert registration.VisibilityRegistrar().posterior_of(pair).outcome is Outcome.AT_LIMIT
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler import se3
-from modeler.closure.consistency import ConsistencyModel, LikelihoodBound, Thresholds, failure, modes
+from modeler.closure.consistency import ConsistencyModel, Thresholds, Usual, modes
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.priors.general import LARGE_DEG
@@ -163,7 +163,7 @@ class Closer:
         """
         if len(posteriors) > self.max_relocations:
             return None
-        return self._relocaliser(map_view, self._evidence(map_view)).next_target(posteriors)
+        return self._relocaliser(map_view, self._usual(map_view)).next_target(posteriors)
 
     def placement(self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> Placement:
         """Return the posterior that places a frame, and why: that of the previous view, or else of another.
@@ -173,7 +173,7 @@ class Closer:
             map_view: the map so far.
             steps: number of frames from the previous view to this one.
         """
-        return self._relocaliser(map_view, self._evidence(map_view), steps=steps).placement(posteriors)
+        return self._relocaliser(map_view, self._usual(map_view), steps=steps).placement(posteriors)
 
     def predicted_motion(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
         """Return the prediction of target_from_source between a frame, placed by a registration, and a view."""
@@ -195,7 +195,7 @@ class Closer:
         """
         base = placement.base
         paths = map_view.shortest_paths(base.target) if base is not None and len(posteriors) > 1 else ShortestPaths()
-        evidence, edges = self._evidence(map_view), []
+        usual, edges = self._usual(map_view), []
         for number, posterior in enumerate(posteriors):
             consecutive = number == 0 and steps == 1
             closes = number > 0 and self._came_back(posterior, map_view, paths)
@@ -204,7 +204,7 @@ class Closer:
             kind: EdgeKind = "closure" if closes else "odometry" if places else "span"
             if is_base:
                 edges.append(Edge(posterior, kind, True, placement.reason))
-            elif reason := failure(posterior) if consecutive else self.thresholds.defect(posterior, evidence):
+            elif reason := self.thresholds.failed(posterior, usual, consecutive=consecutive):
                 edges.append(Edge(posterior, kind, False, reason))
             elif base is None:
                 edges.append(Edge(posterior, kind, False, NotPlaced()))
@@ -222,7 +222,7 @@ class Closer:
         paths = map_view.shortest_paths(posterior.source)
         kind = "closure" if self._came_back(posterior, map_view, paths) else "span"
         predicted = map_view.solution.relative_gaussian(posterior.target, posterior.source)
-        defect = self.thresholds.defect(posterior, self._evidence(map_view))
+        defect = self.thresholds.defect(posterior, self._usual(map_view))
         if reason := defect or self.thresholds.open_rotation(posterior, predicted):
             return Edge(posterior, kind, False, reason)
         length, centroid_m = paths[posterior.target].edges, map_view.views[posterior.source].centroid_m
@@ -232,11 +232,11 @@ class Closer:
     def _came_back(self, posterior: Posterior, map_view: MapView, paths: ShortestPaths) -> bool:
         return map_view.came_back(posterior.target, posterior.source, paths, away_deg=self.away_deg)
 
-    def _evidence(self, map_view: MapView) -> LikelihoodBound:
-        return self.thresholds.likelihood_bound(map_view.edges, map_view.solution)
+    def _usual(self, map_view: MapView) -> Usual:
+        return self.thresholds.usual(map_view.edges, map_view.solution)
 
-    def _relocaliser(self, map_view: MapView, evidence: LikelihoodBound, *, steps: int = 1) -> Relocaliser:
-        return Relocaliser(map_view, self.thresholds, evidence, self.consistency, self.max_angle_deg, steps)
+    def _relocaliser(self, map_view: MapView, usual: Usual, *, steps: int = 1) -> Relocaliser:
+        return Relocaliser(map_view, self.thresholds, usual, self.consistency, self.max_angle_deg, steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,8 +262,8 @@ class Relocaliser:
     """The map so far."""
     thresholds: Thresholds
     """Requirements on registrations."""
-    evidence: LikelihoodBound
-    """Bound from the run's edges."""
+    usual: Usual
+    """How well images match in the run's edges."""
     consistency: ConsistencyModel
     """Test of registrations against each other."""
     max_angle_deg: float
@@ -282,7 +282,7 @@ class Relocaliser:
         odometry = posteriors[0]
         if self._continues(odometry) and (self.steps == 1 or self._angle_off_deg(odometry) <= self.max_angle_deg):
             return Placement(odometry, JoinsPrevious(odometry.outcome, odometry.overlap))
-        candidates = [posterior for posterior in posteriors if self.thresholds.places_alone(posterior, self.evidence)]
+        candidates = [posterior for posterior in posteriors if self.thresholds.places_alone(posterior, self.usual)]
         for posterior in sorted(candidates, key=lambda posterior: -posterior.overlap):
             off_deg = self._angle_off_deg(posterior)
             # At the largest rotation that can be registered, the posterior may be truncated.
@@ -312,7 +312,7 @@ class Relocaliser:
             return None
         poses = self.map_view.poses(untried)
         for posterior in posteriors:
-            if self.thresholds.places_alone(posterior, self.evidence):
+            if self.thresholds.places_alone(posterior, self.usual):
                 placed = self.map_view.solution.trajectory[posterior.target] @ posterior.pose.mean
                 angle_deg = np.degrees(se3.rotation_angle(se3.inverse(poses) @ placed))
                 if angle_deg.min() <= self.max_angle_deg:
@@ -325,8 +325,8 @@ class Relocaliser:
 
     def _continues(self, odometry: Posterior) -> bool:
         """Return whether the previous view's registration is valid and, after lost frames, has enough evidence."""
-        matches = self.steps == 1 or not odometry.log_marginal_likelihood < self.evidence.min_nats
-        return failure(odometry) is None and matches
+        matches = self.steps == 1 or not odometry.log_marginal_likelihood < self.usual.min_nats
+        return matches and self.thresholds.failed(odometry, self.usual, consecutive=True) is None
 
     def _confirmation(self, posterior: Posterior, candidates: Sequence[Posterior]) -> ConfirmedBy | None:
         """Return a consistent registration of another view, if this one is near the extrapolated motion; else None."""

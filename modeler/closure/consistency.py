@@ -17,6 +17,7 @@ from modeler.types import (
     Degenerate,
     Edge,
     Failed,
+    LowCorrelation,
     LowLikelihood,
     LowOverlap,
     OpenRotation,
@@ -26,6 +27,10 @@ from modeler.types import (
     Reason,
     Solution,
 )
+
+_MIN_TURN_DEG = 6.0  # of an edge whose print is compared
+_CORRELATION_SPREAD = 0.2  # sd of that of right edges as a share of the median: measured on captures
+_MIN_CORRELATIONS = 2  # one may be of views that hardly differ
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,10 @@ class Thresholds:
     """The same in robust standard deviations of the run's edges; the larger of both is used."""
     min_edges: int = 5
     """Least number of edges for a median."""
+    min_correlation: float = 0.5
+    """Least correlation of colours in the run's edges from which it counts."""
+    max_other_print_nats: float = 2.3
+    """Largest difference of log likelihoods of a correlation, of other print and of the same: odds of ten to one."""
     max_open_deg: float = 5.0
     """Largest standard deviation in degrees of the rotation about any axis, unless the graph knows it better. An open
     rotation, such as that about the axis of a bottle, is bounded only by the prior's limits, which are already part of
@@ -51,31 +60,51 @@ class Thresholds:
     """Largest standard deviation of such a rotation in degrees. The cosine of it is 0.87: a Gaussian about one mean is
     then wrong about the other axes, of which it is sure."""
 
-    def likelihood_bound(self, edges: Sequence[Edge], solution: Solution) -> LikelihoodBound:
-        """Return the least log marginal likelihood of further edges, from a run's edges between neighbours so far.
+    def usual(self, edges: Sequence[Edge], solution: Solution) -> Usual:
+        """Return how well images match in a run's edges between neighbours so far.
 
         Log evidence depends on shape and sensor and is meaningful only in comparison; that of a wrong pose is far below
-        the scatter of the run's edges.
+        the scatter of the run's edges. So does the correlation of colours depend on print and noise.
         """
         joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
-        all_nats = [edge.posterior.log_marginal_likelihood for edge in islice(joining, RECENT_EDGES)]
-        nats = np.array([evidence for evidence in all_nats if np.isfinite(evidence)])
+        recent = [edge.posterior for edge in islice(joining, RECENT_EDGES)]
+        nats = np.array([posterior.log_marginal_likelihood for posterior in recent])
+        correlations = np.array([posterior.colour_correlation for posterior in recent])
+        nats, correlations = nats[np.isfinite(nats)], correlations[np.isfinite(correlations)]
+        correlation = float(np.median(correlations)) if len(correlations) >= _MIN_CORRELATIONS else float("nan")
         if len(nats) < self.min_edges:
-            return LikelihoodBound()
+            return Usual(correlation=correlation)
         median = float(np.median(nats))
         scatter = 1.4826 * float(np.median(np.abs(nats - median)))
         drop_nats = max(self.max_likelihood_drop_nats, self.max_likelihood_drop_sigmas * scatter)  # method, eq. 9.5
-        return LikelihoodBound(median, median - drop_nats)
+        return Usual(median, median - drop_nats, correlation)
 
-    def defect(self, posterior: Posterior, evidence: LikelihoodBound) -> Reason | None:
+    def defect(self, posterior: Posterior, usual: Usual) -> Reason | None:
         """Return why a posterior is rejected independently of the other edges; None if it is not."""
         if (found := failure(posterior)) is not None:
             return found
         if not posterior.overlap >= self.min_overlap:
             return LowOverlap(posterior.overlap, self.min_overlap)
-        if posterior.log_marginal_likelihood < evidence.min_nats:
-            return LowLikelihood(posterior.log_marginal_likelihood, evidence.median_nats)
-        return None
+        if posterior.log_marginal_likelihood < usual.min_nats:
+            return LowLikelihood(posterior.log_marginal_likelihood, usual.median_nats)
+        return self.other_print(posterior, usual)
+
+    def failed(self, posterior: Posterior, usual: Usual, *, consecutive: bool) -> Reason | None:
+        """Return why a posterior is rejected, see `defect`; one of consecutive frames only where it cannot be right."""
+        return (
+            (failure(posterior) or self.other_print(posterior, usual)) if consecutive else self.defect(posterior, usual)
+        )
+
+    def other_print(self, posterior: Posterior, usual: Usual) -> LowCorrelation | None:
+        """Return the reason if print on surface that matches disagrees, as it does not in the run's edges, or None."""
+        found, expected = posterior.colour_correlation, usual.correlation
+        turned_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))  # print that hardly moves is taken for light
+        if not (expected >= self.min_correlation and turned_deg >= _MIN_TURN_DEG and found < expected):
+            return None
+        by_chance = 1.0 / max(posterior.independent_colours, 1.0)
+        same = by_chance + (_CORRELATION_SPREAD * expected) ** 2
+        nats = 0.5 * ((found - expected) ** 2 / same - found**2 / by_chance + np.log(same / by_chance))  # eq. 9.7
+        return LowCorrelation(found, expected) if nats > self.max_other_print_nats else None
 
     def open_rotation(self, posterior: Posterior, predicted: PoseGaussian) -> OpenRotation | None:
         """Return the reason if a posterior leaves a rotation open that the prediction does not know better, or None."""
@@ -86,19 +115,21 @@ class Thresholds:
             return None
         return OpenRotation(float(np.degrees(sigma_rad)))
 
-    def places_alone(self, posterior: Posterior, evidence: LikelihoodBound) -> bool:
+    def places_alone(self, posterior: Posterior, usual: Usual) -> bool:
         """Return whether a registration may place a frame without that of the previous view."""
-        return posterior.outcome is Outcome.CONVERGED and self.defect(posterior, evidence) is None
+        return posterior.outcome is Outcome.CONVERGED and self.defect(posterior, usual) is None
 
 
 @dataclass(frozen=True)
-class LikelihoodBound:
-    """The log marginal likelihood of a run's edges, and the least of further ones."""
+class Usual:
+    """How well images match in the edges of a run."""
 
     median_nats: float = float("nan")
-    """Median of the run's edges; NaN: not known yet."""
+    """Median log marginal likelihood; NaN: not known yet."""
     min_nats: float = -float("inf")
     """Bound below which an edge is rejected."""
+    correlation: float = float("nan")
+    """Median correlation of colours; NaN: not known yet."""
 
 
 def failure(posterior: Posterior) -> Reason | None:

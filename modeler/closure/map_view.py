@@ -58,14 +58,14 @@ class MapView:
         return heapq.nsmallest(2, self.frames, key=lambda view: abs(view - frame))
 
     def extrapolated(self, frame: int) -> Array:
-        """Return object_from_camera (4, 4) of a frame, extrapolated from the two views nearest in time (eq. 9.8).
+        """Return object_from_camera (4, 4) of a frame, extrapolated from the two views nearest in time (eq. 9.9).
 
         For a new frame these are the last two; a lost frame lies between two, or before the first.
         """
         near, *other = self.nearest_in_time(frame)
         if not other:
             return self.solution.trajectory[near]
-        pace = (frame - near) / (near - other[0])  # method, eq. 9.8
+        pace = (frame - near) / (near - other[0])  # method, eq. 9.9
         return self.solution.trajectory[near] @ se3.exp(pace * se3.log(self.solution.relative(other[0], near)))
 
     def came_back(self, target: int, source: int, paths: ShortestPaths, *, away_deg: float) -> bool:
@@ -81,7 +81,7 @@ class MapView:
         between = (frames > min(target, source)) & (frames < max(target, source))
         rotations = [self.all_poses[between, :3, :3], self.poses(paths.along(target))[:, :3, :3]]
         cosine = 0.5 * (np.tensordot(np.concatenate(rotations), self.solution.trajectory[target][:3, :3], 2) - 1.0)
-        return bool(cosine.min(initial=1.0) <= np.cos(np.radians(away_deg)))  # method, eq. 9.7
+        return bool(cosine.min(initial=1.0) <= np.cos(np.radians(away_deg)))  # method, eq. 9.8
 
     @cached_property
     def network(self) -> PathNetwork:

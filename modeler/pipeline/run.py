@@ -156,6 +156,7 @@ class Run:
 
     def refine(self) -> Iterator[Refining]:
         """Register further pairs of views, whose edges make the poses more precise; none if an axis fits all steps."""
+        self.state = self.state.rejudged(self.modeler.closer.judge_span)
         tracker = self.modeler.tracker(self.state)
         if doubtful := self.state.less_probable(self.modeler.prior, tracker.learned_prior):
             pairs = [(edge.source, edge.target) for edge in doubtful]

@@ -20,6 +20,7 @@ from modeler.types import (
     FocalLength,
     InputError,
     JoinsPrevious,
+    NotPlaced,
     PoseGaussian,
     Posterior,
     RayImage,
@@ -202,6 +203,19 @@ class State:
         spans = tuple(moved[edge] for edge in self.spans)
         smoother = replace(self.smoother, focal=None).to(graph)
         return replace(self, graph=graph, smoother=smoother, views=views, ready=ready, newest=newest, spans=spans)
+
+    def rejudged(self, judge: Callable[[Posterior, MapView], Edge]) -> State:
+        """Return the state with registrations judged anew of frames that were placed only later, by other ones."""
+        early = [
+            edge
+            for edge in self.graph.edges
+            if isinstance(edge.reason, NotPlaced) and edge.source in self.views and edge.target in self.views
+        ]
+        if not early:
+            return self
+        again = [judge(edge.posterior, self.map_view) for edge in early]
+        graph = replace(self.graph, edges=(*(edge for edge in self.graph.edges if edge not in early), *again))
+        return replace(self, graph=graph, smoother=self.smoother.to(graph))
 
     def reregistered(self, edges: Sequence[Edge], found: Iterable[Posterior]) -> State:
         """Return the state with edges registered again: those with a usable posterior, given in the same order."""

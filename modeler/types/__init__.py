@@ -43,6 +43,7 @@ from modeler.types.reasons import ElsewhereThanSegments as ElsewhereThanSegments
 from modeler.types.reasons import Failed as Failed
 from modeler.types.reasons import JoinsPrevious as JoinsPrevious
 from modeler.types.reasons import JoinsSegments as JoinsSegments
+from modeler.types.reasons import LowCorrelation as LowCorrelation
 from modeler.types.reasons import LowLikelihood as LowLikelihood
 from modeler.types.reasons import LowOverlap as LowOverlap
 from modeler.types.reasons import NearExtrapolation as NearExtrapolation

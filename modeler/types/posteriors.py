@@ -74,6 +74,10 @@ class Posterior:
     """Overlap below which the method considers the surfaces not to match, whatever the outcome."""
     contradicted: bool = field(default=False, kw_only=True)
     """Whether the images contradict the mean more than 99 of 100 right ones, if the method can test this."""
+    colour_correlation: float = field(default=float("nan"), kw_only=True)
+    """Correlation of the colours of matching surface at the mean; NaN if they were not compared."""
+    independent_colours: float = field(default=0.0, kw_only=True)
+    """Number of independent ones."""
     samples: Array = field(default_factory=lambda: _NO_POSES)
     """(n, 4, 4) samples of target_from_source; empty if the method draws none."""
     weights: Array = field(default_factory=lambda: _NO_WEIGHTS)

@@ -110,6 +110,14 @@ class LowLikelihood:
 
 
 @dataclass(frozen=True)
+class LowCorrelation:
+    """Print on the surface that matches is not the same, as it is in other edges."""
+
+    correlation: float
+    median: float
+
+
+@dataclass(frozen=True)
 class NotPlaced:
     """No registration of the frame is certain enough to place it."""
 
@@ -165,6 +173,7 @@ Reason: TypeAlias = (
     | Degenerate
     | LowOverlap
     | LowLikelihood
+    | LowCorrelation
     | NotPlaced
     | OpenRotation
     | Consistency
@@ -232,6 +241,8 @@ def summary(reason: Reason) -> str:
             return f"the overlap {overlap:.2f} is below {min_overlap:.2f}"
         case LowLikelihood(nats, median_nats):
             return f"the images contradict it: log likelihood {nats:.0f}, median of other edges {median_nats:.0f}"
+        case LowCorrelation(correlation, median):
+            return f"print contradicts it: a correlation of {correlation:.2f}, median of other edges {median:.2f}"
         case NotPlaced():
             return "neither the previous view nor another one places the frame reliably"
         case OpenRotation(sigma_deg):

@@ -237,6 +237,22 @@ class PairLikelihood:
         found = self._summed(rows(pose[None]), surface_m, band, stride=1, typical_misfit=MISFIT)
         return MatchNoise(surface_m, float(correlations(found)[0]), band)
 
+    def agreement(self, pose: Array, blurs_m: Array) -> tuple[float, float]:
+        """Return how well the colours of matching surface agree under a pose (4, 4), and how many are independent.
+
+        It is the largest correlation of the bands for some blurs (k,), as displaced colours agree in wide bands only;
+        NaN without colour. The number is that of the finest band.
+        """
+        if self.colour is None:
+            return math.nan, 0.0
+        most, found = self.forward.model.max_independent_colours, []
+        for blur_m in blurs_m:
+            band = self.colour.band(float(blur_m))
+            summed = self._summed(rows(pose[None]), float(blur_m), band, stride=1, typical_misfit=MISFIT)
+            found.append((float(correlations(summed)[0]), float(self.colour.compared(summed, band, most, stride=1)[0])))
+        largest, counts = np.max(found, axis=0)
+        return float(largest), float(counts)
+
     def typical_misfit(self, pose: Array, blur_m: float) -> float:
         """Return the misfit μ at which matches under a good pose (4, 4) contribute 0 on average (method, eq. 4.7).
 

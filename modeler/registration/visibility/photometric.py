@@ -74,11 +74,15 @@ class PairColour:
             max_independent: largest number of independent features.
             stride: every `stride`-th point was used.
         """
-        compared = sum(len(colours.values) for colours in self.colours(band, stride))
-        count = scored[:, scores.MATCHES] / compared * self.independent(band, max_independent)
+        count = self.compared(scored, band, max_independent, stride=stride)
         # To first order in ρ²: the exact logarithm has peaks too narrow to sample.
         gain = 0.5 * count * np.maximum(correlations(scored), 0.0) ** 2
         return np.asarray(np.logaddexp(0.0, gain - 0.5 * np.log(np.maximum(count, 1.0))), dtype=np.float64)
+
+    def compared(self, scored: Array, band: int, max_independent: float, *, stride: int) -> Array:
+        """Return the numbers n_c (n,) of independent features that are compared; arguments as `log_likelihoods`."""
+        points = sum(len(colours.values) for colours in self.colours(band, stride))
+        return np.asarray(scored[:, scores.MATCHES] / points * self.independent(band, max_independent))
 
     def curvature(self, correlation: float, band: int, max_independent: float) -> float:
         """Return twice the decrease of `log_likelihoods` per mean square difference of features."""

@@ -99,6 +99,8 @@ class VisibilityRegistrar(AbstractRegistrar):
         source, target, density, rng = views.source, views.target, views.density, views.rng
         if min(len(source.points_m), len(target.points_m)) < self.min_points:
             return failed(source, target, Outcome.TOO_FEW_POINTS, density, rng)
+        if views.near is not None and not np.isfinite(density.log_prior(views.near[None]))[0]:
+            return failed(source, target, Outcome.AT_LIMIT, density, rng)  # as of an edge between segments
         pair = self.likelihood.between(source, target, rng)
         found = self.search.run(pair, density, rng, min_overlap=self.min_overlap, near=views.near)
         # Overlaps are judged without noise near silhouettes, which the misfit of a wrong pose increases.
@@ -199,6 +201,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         # Among very many poses, some match by chance; among few, the likeliest is right even if a mask is truncated.
         contradicted = not pair.fits(modes[0].pose.mean, self.search.fine_m(pair))
         matches = not (found.any_rotation and contradicted)
+        correlation, independent = pair.agreement(modes[0].pose.mean, self.search.blurs_m(pair))
         effective = 1.0 / sum(share**2 / mode.effective_samples for share, mode in weighted)
         return Posterior(
             source=pair.backward.image.index,
@@ -208,6 +211,8 @@ class VisibilityRegistrar(AbstractRegistrar):
             overlap=overlap,
             least_overlap=self.min_overlap,
             contradicted=contradicted,
+            colour_correlation=correlation,
+            independent_colours=independent,
             samples=samples,
             weights=weights,
             modes=modes if len(modes) > 1 else (),
