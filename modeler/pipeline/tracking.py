@@ -13,6 +13,7 @@ from modeler.pipeline.pairs import Registrations
 from modeler.pipeline.state import State, newest_ready
 from modeler.registration.posterior import failed
 from modeler.system.concurrency import parallel_map
+from modeler.system.disk_arrays import release
 from modeler.types import (
     AbstractPrior,
     Edge,
@@ -122,7 +123,10 @@ class Tracker:
         """Return a view with the images that a likelihood looks up."""
         known = view if view.layers else self.state.ready.get(view.index)
         if known is None:
-            known = self.cache.get(view.index) or self.sensor.ray_image(view.frame, view.plane)
+            known = self.cache.get(view.index)
+            if known is None:
+                known = self.sensor.ray_image(view.frame, view.plane)
+                release(view.frame.depth_m)  # or all views that are registered again would stay in memory
             with self._lock:
                 self.cache.pop(view.index, None)  # inserted anew, as the newest
                 self.cache[view.index] = known
