@@ -26,6 +26,8 @@ from modeler.types import (
     Frame,
     FrameRecord,
     HandPoses,
+    LowCorrelation,
+    LowLikelihood,
     LowOverlap,
     Mode,
     OpenRotation,
@@ -483,6 +485,9 @@ FAR_APART = LowOverlap(0.2, 0.4)
         (TURN_DEG[:11], {"refused": Failed(Outcome.NO_OVERLAP)}, []),
         (TURN_DEG[:11], {"refused": Failed(Outcome.NO_OVERLAP), "expected": True}, ["closures_refused"]),
         (TURN_DEG[:11], {"refused": CONTRADICTS}, ["closures_refused"]),
+        (TURN_DEG[:11], {"refused": LowLikelihood(-90.0, -20.0)}, []),
+        (TURN_DEG[:11], {"refused": LowCorrelation(0.0, 0.8)}, []),
+        (TURN_DEG, {"refused": LowCorrelation(0.0, 0.8)}, ["closures_refused"]),
     ],
 )
 def test_each_fault_of_a_run_has_its_code(angles_deg: list[float], how: dict[str, Any], codes: list[str]) -> None:

@@ -21,6 +21,8 @@ from modeler.types import (
     Failed,
     FocalLength,
     FrameRecord,
+    LowCorrelation,
+    LowLikelihood,
     LowOverlap,
     OpenRotation,
     OptimisationOutlier,
@@ -348,7 +350,8 @@ def _unconfirmed_join(edges: Sequence[Edge]) -> list[Shortcoming]:
 
 def _is_conclusive(edge: Edge, solution: Solution) -> bool:
     """Return whether a rejected closure is conclusive: views far apart may share too little surface for one."""
-    bare = isinstance(edge.reason, LowOverlap) or edge.reason == Failed(Outcome.NO_OVERLAP)
+    unlike = LowOverlap | LowLikelihood | LowCorrelation
+    bare = isinstance(edge.reason, unlike) or edge.reason == Failed(Outcome.NO_OVERLAP)
     known = edge.source in solution.trajectory and edge.target in solution.trajectory
     near = known and np.degrees(se3.rotation_angle(solution.relative(edge.target, edge.source))) <= NEAR_DEG
     return bool(near) or not bare
