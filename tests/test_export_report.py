@@ -141,6 +141,8 @@ def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None
         step.edges_so_far[0].posterior,
         pareto_k=0.31,
         log_marginal_likelihood=-12.3,
+        colour_correlation=0.7,
+        independent_colours=80.5,
         seconds=0.1,
         outcome=Outcome.AMBIGUOUS,
     )
@@ -154,7 +156,15 @@ def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None
         np.testing.assert_array_equal(posterior.pose.mean, sent.posterior.pose.mean)
         np.testing.assert_array_equal(posterior.pose.covariance, sent.posterior.pose.covariance)
         assert posterior.outcome is sent.posterior.outcome
-        for name in ("overlap", "effective_samples", "pareto_k", "log_marginal_likelihood", "seconds"):
+        for name in (
+            "overlap",
+            "colour_correlation",
+            "independent_colours",
+            "effective_samples",
+            "pareto_k",
+            "log_marginal_likelihood",
+            "seconds",
+        ):
             np.testing.assert_equal(getattr(posterior, name), getattr(sent.posterior, name))
     for frame, pose in poses_of(report).items():
         np.testing.assert_array_equal(pose.mean, step.solution.trajectory[frame])

@@ -92,6 +92,8 @@ def _posterior(edge: Mapping[str, Any]) -> Posterior:
         modes=tuple(Mode(_number(mode["weight"]), _gaussian(mode)) for mode in edge.get("modes") or ()),
         outcome=Outcome(edge["outcome"]),
         overlap=_number(edge["overlap"]),
+        colour_correlation=_number(edge.get("colour_correlation")),
+        independent_colours=float(edge.get("independent_colours") or 0.0),
         effective_samples=_number(edge["effective_samples"]),
         pareto_k=_number(edge["pareto_k"]),
         log_marginal_likelihood=_number(edge["log_evidence"]),
@@ -116,7 +118,18 @@ def _number(value: float | None) -> float:
 
 
 # Reports of earlier versions have none of these.
-_LATER = frozenset({"by_focal", "covariance_given_camera", "modes", "cause", "mask", "reason"})
+_LATER = frozenset(
+    {
+        "by_focal",
+        "covariance_given_camera",
+        "modes",
+        "cause",
+        "mask",
+        "reason",
+        "colour_correlation",
+        "independent_colours",
+    }
+)
 
 
 def fault(report: Mapping[str, Any]) -> str | None:
@@ -302,6 +315,8 @@ _EDGE: dict[str, Test] = {
     **_MOTION,
     "modes": _null_or(_are_modes),
     "overlap": _is_number_or_null,
+    "colour_correlation": _is_number_or_null,
+    "independent_colours": _is_number_or_null,
     "effective_samples": _is_number_or_null,
     "pareto_k": _is_number_or_null,
     "log_evidence": _is_number_or_null,

@@ -198,6 +198,8 @@ def edge_record(
         "pareto_k": posterior.pareto_k,
         "log_evidence": posterior.log_marginal_likelihood,
         "overlap": posterior.overlap,
+        "colour_correlation": posterior.colour_correlation,
+        "independent_colours": posterior.independent_colours,
         "seconds": posterior.seconds,
     }
     return json_value(record)
