@@ -28,14 +28,15 @@ from modeler.types import (
     Solution,
 )
 
-_MIN_TURN_DEG = 6.0  # of an edge whose print is compared
+MIN_TURN_DEG = 6.0
+"""Least rotation between views whose print is compared: what hardly moves is taken for light."""
 _CORRELATION_SPREAD = 0.2  # sd of that of right edges as a share of the median: measured on captures
 _MIN_CORRELATIONS = 2  # one may be of views that hardly differ
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Requirements on edges other than that to the previous view; docs/method/closure.md has their origins."""
+    """Requirements on edges, of which print alone holds for that to the previous view, too (docs/method/closure.md)."""
 
     min_overlap: float = 0.4
     """Least overlap (0..1), predicted and measured."""
@@ -64,7 +65,7 @@ class Thresholds:
         """Return how well images match in a run's edges between neighbours so far.
 
         Log evidence depends on shape and sensor and is meaningful only in comparison; that of a wrong pose is far below
-        the scatter of the run's edges. So does the correlation of colours depend on print and noise.
+        the scatter of the run's edges. The correlation of colours depends on print and noise likewise.
         """
         joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
         recent = [edge.posterior for edge in islice(joining, RECENT_EDGES)]
@@ -98,8 +99,8 @@ class Thresholds:
     def other_print(self, posterior: Posterior, usual: Usual) -> LowCorrelation | None:
         """Return the reason if print on surface that matches disagrees, as it does not in the run's edges, or None."""
         found, expected = posterior.colour_correlation, usual.correlation
-        turned_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))  # print that hardly moves is taken for light
-        if not (expected >= self.min_correlation and turned_deg >= _MIN_TURN_DEG and found < expected):
+        turned_deg = np.degrees(se3.rotation_angle(posterior.pose.mean))
+        if not (expected >= self.min_correlation and turned_deg >= MIN_TURN_DEG and found < expected):
             return None
         by_chance = 1.0 / max(posterior.independent_colours, 1.0)
         same = by_chance + (_CORRELATION_SPREAD * expected) ** 2

@@ -75,7 +75,7 @@ class Posterior:
     contradicted: bool = field(default=False, kw_only=True)
     """Whether the images contradict the mean more than 99 of 100 right ones, if the method can test this."""
     colour_correlation: float = field(default=float("nan"), kw_only=True)
-    """Correlation of the colours of matching surface at the mean; NaN if they were not compared."""
+    """Correlation of the colours of matching surface at the mean, the largest of several bands; NaN: not compared."""
     independent_colours: float = field(default=0.0, kw_only=True)
     """Number of independent ones."""
     samples: Array = field(default_factory=lambda: _NO_POSES)

@@ -17,13 +17,14 @@ from scipy import ndimage
 from scipy.special import ndtri
 
 from modeler import se3
+from modeler.closure.consistency import MIN_TURN_DEG
 from modeler.kernels.photometric import displaced_correlations
 from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage, spread
 from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS
 from modeler.views import Sensor
 
 _PAIRS: Final = 12  # of views that are compared, spread over the run: one has a sd of some 0.1
-NEAR_DEG, FAR_DEG = 6.0, 50.0  # rotation between views: highlights stay where they are, and surface is shared
+NEAR_DEG, FAR_DEG = MIN_TURN_DEG, 50.0  # rotation between views that share surface
 MIN_SHARED: Final = 60  # points of a pair: the sd of a chance correlation is then 0.13
 _MARGIN: Final = 4.0  # widths of the fine band: nearer to its outline, a feature is of the background
 _WIDTH: Final = 0.01  # of the object's extent in px: width of the fine band, at least a pixel
