@@ -348,7 +348,6 @@ def test_directions_that_nobody_saw_keep_the_spread_of_the_prior(
 def test_a_fit_of_few_matches_is_no_overlap(pair: Pair, rng: np.random.Generator) -> None:
     initial = start(pair[0], pair[1], Normal(np.eye(4), pair[0].centroid_m, 0.1, 0.01), rng)
     fit = IcpRegistrar().refine(Cloud.of(pair[0]), Cloud.of(pair[1]), se3.translation(np.array([0.0, 0.0, 0.5])))
-    assert fit is not None
     assert posterior(pair[0], pair[1], initial, fit, min_fitness=0.1).outcome is Outcome.NO_OVERLAP
 
 

@@ -57,7 +57,6 @@ def test_a_run_is_as_certain_when_it_is_opened_again(built: Path) -> None:
         covariance = np.reshape(pose["covariance"], (6, 6))
         np.testing.assert_allclose(run.solution.covariances[pose["id"]], covariance, rtol=1e-3, atol=1e-12)
     camera = run.report["camera"]
-    assert run.solution.focal is not None
     assert run.solution.focal.sigma == camera["focal_factor_sigma"] > 0.0
 
 

@@ -84,7 +84,6 @@ def test_a_watertight_model_is_closed_and_marks_what_it_made_up():
         assert mesh.is_winding_consistent
         assert np.array_equal(edge_uses(model.triangles), np.ones((len(mesh.edges_unique), 2)))
         assert mesh.body_count == 1
-        assert model.vertex_views is not None
         made_up = model.vertex_views == 0
         assert np.isinf(model.vertex_sigmas_m[made_up]).all()
         assert np.quantile(np.abs(body.distance(model.vertices_m[~made_up])), 0.95) < 0.5 * VOXEL_M

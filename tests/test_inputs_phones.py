@@ -53,7 +53,6 @@ def confidence() -> np.ndarray:
 
 
 def larger(colour: np.ndarray | None, factor: int) -> np.ndarray:
-    assert colour is not None
     return colour.repeat(factor, axis=0).repeat(factor, axis=1)
 
 

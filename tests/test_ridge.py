@@ -108,7 +108,6 @@ def bowls(seed: int) -> tuple[RayImage, RayImage, Array]:
     turns = Places((Place(), Place(rotation_deg=(0.0, 0.0, 40.0))))
     sequence = RenderedSequence(replace(load_recipe("bowl"), seed=seed, trajectory=turns))
     noise, truth, segmenter = sequence.sensor(), sequence.truth(), Segmenter()
-    assert noise is not None
     frames = [sequence.frame(index) for index in (0, 1)]
     scene = segmenter.scene(frames)
     sensor = Sensor(noise).measured(scene.range_noise)

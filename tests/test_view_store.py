@@ -23,8 +23,6 @@ VIEW = tabletop.view(tabletop.Box((0.06, 0.045, 0.08)), tabletop.turntable(1)[0]
 
 def arrays(view: RayImage) -> dict[str, np.ndarray]:
     frame = view.frame
-    assert frame.mask is not None
-    assert frame.colour is not None
     return {"depth": frame.depth_m, "mask": frame.mask, "colour": frame.colour, "points": view.points_m} | {
         "normals": view.normals,
         "pixels": view.pixels,
