@@ -71,6 +71,7 @@ def report(folder: Path) -> dict:
         (("--verson",), "'--verson'"),
         (("build", "SCENE", "--out", "OUT", "--step-deg", "0.3rad"), "--step-deg"),
         (("build", "SCENE", "--out", "OUT", "--max-offset-m", "40"), "at most 5\n"),
+        (("build", "SCENE", "--out", "OUT", "--voxel-m", "0"), "--voxel-m 0 is out of range"),
         (("build", "SCENE", "--out", "OUT", "--method", "magic"), "'magic'"),
         (("export", "OUT", "--out", "OUT.glb", "--tint", "red"), "'red'"),
         (("register", "SCENE", "one", "0"), "SOURCE: "),
@@ -410,23 +411,16 @@ def test_frames_without_a_hand_are_not_said_to_lack_the_object(hand: int, given:
     assert bool(visible_frames([frame | {"id": place} for place, frame in enumerate(frames)])) is given
 
 
-def test_ctrl_c_ends_the_frames_and_a_second_one_the_program() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    seen = []
+@pytest.mark.parametrize(("count", "seen", "early"), [(5, [0, 1], True), (2, [0, 1], False)])
+def test_ctrl_c_ends_the_frames_and_a_second_one_the_program(count: int, seen: list[int], early: bool) -> None:
+    """After the last frame the first one changes nothing."""
+    before, taken = signal.getsignal(signal.SIGINT), list[int]()
     with Interrupt() as interrupt:
-        for item in interrupt.until(range(5)):
-            seen.append(item)
+        for item in interrupt.until(range(count)):
+            taken.append(item)
             if item == 1:
                 signal.raise_signal(signal.SIGINT)
-        assert (seen, interrupt.ended_early) == ([0, 1], True)
+        assert (taken, interrupt.ended_early) == (seen, early)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_ctrl_c_after_the_last_frame_changes_nothing() -> None:
-    with Interrupt() as interrupt:
-        for item in interrupt.until(range(2)):
-            if item == 1:
-                signal.raise_signal(signal.SIGINT)
-    assert not interrupt.ended_early

@@ -94,11 +94,6 @@ def test_a_trial_is_what_register_gives_of_the_pair(method: AbstractRegistrar, a
         assert found.seconds == (0.5 if assumed and isinstance(method, ContradictedWithin) else 0.25)
 
 
-def test_pairs_of_the_dragon_protocol_are_thirty_a_step() -> None:
-    pairs = list(Pairing(offsets=(1, 2, 3, 4), both_ways=True, closed=True).pairs(range(15)))
-    assert len(set(pairs)) == 4 * 30
-
-
 def test_tries_every_pair_by_every_method_and_knows_how_many() -> None:
     trials = list(experiment().trials(Recording()))
     assert len(trials) == experiment().size(Recording()) == 10

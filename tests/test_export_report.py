@@ -127,13 +127,6 @@ def test_report_doubts_a_model_some_of_whose_frames_may_be_turned(tmp_path: Path
     assert some["reasons"][0].endswith("(one standard deviation), 2 more by over 1.5°")
 
 
-def test_report_in_the_middle_of_a_run_says_so(tmp_path: Path) -> None:
-    run = RunFolder.open(tmp_path)
-    report = [run.write(step, META) for step in made_up_steps()[:2]][-1]
-    assert (report["complete"], report["trustworthy"]) == (False, False)
-    assert "the run has not finished" in report["reasons"]
-
-
 def test_posteriors_come_back_from_the_report_to_the_bit(tmp_path: Path) -> None:
     run = RunFolder.open(tmp_path)
     step = made_up_steps()[-1]

@@ -10,8 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from ring_graphs import OBJECT_M, covariance, edge, measured, nees, ring, spin, spun, turntable
-from scipy import stats
+from ring_graphs import OBJECT_M, covariance, edge, measured, ring, spin, spun, turntable
 
 from modeler import se3
 from modeler.export import g2o_text
@@ -30,15 +29,6 @@ def _assert_same_covariance(actual: Array, expected: Array, atol: float = 2e-3) 
     whiten = np.linalg.inv(np.linalg.cholesky(expected))
     np.testing.assert_allclose(whiten @ actual @ whiten.T, np.eye(6), atol=atol)
     np.testing.assert_array_equal(actual, actual.T)
-
-
-def test_graph_is_a_value() -> None:
-    graph, _ = ring(3, np.random.default_rng(0), [])
-    longer = PoseGraph().plus(graph.edges[:1]).plus(graph.edges[1:])
-    assert longer.edges == graph.edges
-    assert PoseGraph().edges == ()
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        graph.edges = ()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_empty_graph_has_no_poses_and_a_started_one_has_its_first() -> None:
@@ -75,28 +65,6 @@ def test_two_measurements_of_one_motion_fuse_in_the_source_frame() -> None:
     assert np.abs(first.mean - fused).max() > 2e-3
     # Both sit at the fused pose to first order only: a hundredth here.
     _assert_same_covariance(solution.covariances[1], np.linalg.inv(information).astype(np.float64), atol=0.05)
-
-
-def test_optimised_poses_are_calibrated_and_closure_helps() -> None:
-    """NEES of a pose is chi² with 6 degrees of freedom over many random loops, alone and relative to another frame."""
-    trials = 250
-    absolute, relative, before, after = (np.zeros(trials) for _ in range(4))
-    for trial in range(trials):
-        rng = np.random.default_rng(trial)
-        graph, truth = ring(12, rng, [(0, 11), (1, 11)])
-        frame, other = 1 + trial % 11, (5 + 3 * trial) % 12
-        other = other if other != frame else 0
-        solution = solve(graph, {})
-        assert solution.outliers == ()
-        absolute[trial] = nees(PoseGaussian(solution.trajectory[frame], solution.covariances[frame]), truth[frame])
-        relative[trial] = nees(solution.relative_gaussian(other, frame), se3.inverse(truth[other]) @ truth[frame])
-        before[trial] = se3.rotation_angle(se3.inverse(truth[11]) @ solution.odometry[11])
-        after[trial] = se3.rotation_angle(se3.inverse(truth[11]) @ solution.trajectory[11])
-    for values in (absolute, relative):
-        assert values.mean() == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / trials))
-        assert stats.kstest(values, stats.chi2(6).cdf).pvalue > 1e-3
-    # Two edges of the odometry's kind against a chain of eleven.
-    assert after.mean() < 0.4 * before.mean()
 
 
 def test_closure_lowers_every_predicted_uncertainty() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,8 @@ from bop_scenes import CAMERA, INDICES
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modeler import se3
 from modeler.cli import main
+from modeler.export import RunFolder
 from modeler.sequences import AbstractSequence, KeptSequence, bundled, frame_range, open_sequence, write_bop
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import write_tum
@@ -114,53 +115,19 @@ def test_a_sequence_has_no_poses_to_convert(
     assert not (tmp_path / "poses.txt").exists()
 
 
-def test_poses_of_a_run_go_to_bop_and_tum(tmp_path: Path, rng: np.random.Generator) -> None:
-    run = tmp_path / "run"
-    run.mkdir()
-    poses = {index: se3.exp(0.3 * rng.normal(size=6)) for index in (2, 5)}
-    frame = {"points": 900, "outcome": "accepted"}
-    covariance = {"covariance": np.eye(6).ravel().tolist()}
-    report = {
-        "schema": 1,
-        "sequence": "cup",
-        "settings": {},
-        "seconds": {},
-        "closed": False,
-        "trustworthy": True,
-        "reasons": [],
-        "frames": [{"id": index, "timestamp": 0.5 * index} | frame for index in (2, 3, 5)],
-        "edges": [],
-        "poses": [
-            {"id": index, "object_from_camera": pose.ravel().tolist()} | covariance for index, pose in poses.items()
-        ],
-    }
-    (run / "report.json").write_text(json.dumps(report))
-    assert main(["convert", str(run), "--out", str(tmp_path / "scene_gt.json")]) == 0
+def test_poses_of_a_run_go_to_bop(built: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
+    poses = {str(pose["id"]): pose["object_from_camera"] for pose in RunFolder(built).report()["poses"]}
+    assert main(["convert", str(built), "--out", str(tmp_path / "scene_gt.json")]) == 0
     written = json.loads((tmp_path / "scene_gt.json").read_text())
-    assert set(written) == {"2", "5"}
-    for index, pose in poses.items():
-        entry = written[str(index)][0]
+    assert written.keys() == poses.keys()
+    for index, numbers in poses.items():
+        pose, (entry,) = np.reshape(numbers, (4, 4)), written[index]
         np.testing.assert_allclose(np.reshape(entry["cam_R_m2c"], (3, 3)), pose[:3, :3].T, atol=1e-12)
         np.testing.assert_allclose(entry["cam_t_m2c"], -1000.0 * pose[:3, :3].T @ pose[:3, 3], atol=1e-9)
-    assert main(["convert", str(run), "--out", str(tmp_path / "poses.txt")]) == 0
-    rows = np.loadtxt(tmp_path / "poses.txt")
-    np.testing.assert_allclose(rows[:, 0], [1.0, 2.5])
-    np.testing.assert_allclose(rows[:, 1:4], [pose[:3, 3] for pose in poses.values()])
-    assert main(["convert", str(run), "--out", str(tmp_path / "poses.csv")]) == 2
-    for option in (["--every", "2"], ["--frames", "2:"], ["--sensor", "x.json"], ["--depth-scale-mm", "1"]):
-        assert main(["convert", str(run), "--out", str(tmp_path / "part.txt"), *option]) == 2
-    assert not (tmp_path / "part.txt").exists()
-    stray = {"id": 7, "object_from_camera": np.eye(4).ravel().tolist()} | covariance
-    for broken in (
-        {"schema": 1, "poses": [{"id": "x"}]},
-        report | {"poses": [stray]},
-        report | {"poses": [stray | {"id": 2, "object_from_camera": [2.0] * 16}]},
-        report | {"frames": [{"id": 2, "timestamp": 10**400} | frame], "poses": []},
-        report | {"poses": [stray | {"id": 2, "object_from_camera": [10**400, *stray["object_from_camera"][1:]]}]},
-    ):
-        (run / "report.json").write_text(json.dumps(broken))
-        assert main(["convert", str(run), "--out", str(tmp_path / "other.txt")]) == 2
-        assert not (tmp_path / "other.txt").exists()
+    for option in ("--every 2", "--frames 2:", "--sensor x.json", "--depth-scale-mm 1"):
+        refusal("convert", built, "--out", tmp_path / "part.txt", *option.split())
+    refusal("convert", built, "--out", tmp_path / "poses.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["scene_gt.json"]
 
 
 def test_a_model_is_built_from_any_of_them(tmp_path: Path, frames: list[Frame]) -> None:

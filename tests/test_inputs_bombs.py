@@ -69,12 +69,14 @@ def test_what_was_packed_comes_out_unless_it_is_too_much(kind: str) -> None:
     content = bytes(range(256)) * 40
     packed = pack(content)
     assert unpack(packed) == unpack(packed, len(content)) == content
-    with pytest.raises(ValueError, match="more than"):
-        unpack(packed, len(content) - 1)
+    assert unpack(pack(b"")) == b""
     for cut in (0, 1, len(packed) // 2, len(packed) - 1):
         with pytest.raises((ValueError, OSError, RuntimeError, EOFError, bag.zstd.ZstdError)):
             unpack(packed[:cut])
-    assert unpack(pack(b"")) == b""
+    large = pack(bytes(32 * MEGABYTE))
+    for much, limit in ((packed, len(content) - 1), (large, MEGABYTE)):
+        with frugal(), pytest.raises(ValueError, match="more than"):
+            unpack(much, limit)
 
 
 def test_frames_in_a_row_count_together() -> None:
@@ -82,14 +84,6 @@ def test_frames_in_a_row_count_together() -> None:
     assert from_zstd(pack(b"a" * 10) + pack(b"b" * 10)) == b"a" * 10 + b"b" * 10
     with pytest.raises(ValueError, match="more than"):
         from_zstd(pack(b"a" * 10) + pack(b"b" * 10), 19)
-
-
-@pytest.mark.parametrize("kind", UNPACKERS)
-def test_no_more_is_unpacked_than_may_be(kind: str) -> None:
-    pack, unpack = UNPACKERS[kind]
-    packed = pack(bytes(32 * MEGABYTE))
-    with frugal(), pytest.raises(ValueError, match="more than"):
-        unpack(packed, MEGABYTE)
 
 
 def record(kind: int, body: bytes) -> bytes:
@@ -129,9 +123,7 @@ def test_a_chunk_of_mcap_larger_than_its_file_is_refused(tmp_path: Path, refused
 
 
 @pytest.mark.parametrize("compression", rosbag1.Writer.CompressionFormat)
-def test_chunks_of_ros_1_are_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: rosbag1.Writer.CompressionFormat
-) -> None:
+def test_chunks_of_ros_1_are_bounded(tmp_path: Path, compression: rosbag1.Writer.CompressionFormat) -> None:
     path = Recorder(compression=compression).write(tmp_path / "s.bag", small_frames(1))
     for chunk in Bag(path)._reader.chunks.values():  # type: ignore[union-attr]
         assert chunk.decompressor in (from_bz2, from_lz4)

@@ -8,15 +8,14 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from command_runner import QUICK, Run, refusal_of, spawned, with_files_of_at_most
+from command_runner import QUICK, Run, refusal_of, with_files_of_at_most
 
 from modeler.cli import main
 from modeler.export import RunFolder
-from modeler.sequences import open_sequence, write_bop
+from modeler.sequences import write_bop
 from modeler.types import InputError
 from studies.formats.image_folders import small_frames
 
@@ -42,37 +41,6 @@ def test_a_disk_that_fills_ends_a_build_which_can_go_on(
     for name in ("model.ply", "trajectory.txt", "graph.g2o"):
         assert (tmp_path / "run" / name).read_bytes() == (built / name).read_bytes()
     assert RunFolder(tmp_path / "run").report()["complete"]
-
-
-def test_a_recording_that_is_cut_off_is_said(scene: Path, tmp_path: Path) -> None:
-    short = write_half(scene, tmp_path / "in")
-    assert main(["build", str(short), "--out", str(tmp_path / "run"), *QUICK]) == 0
-    sizes = [path.stat().st_size for path in (tmp_path / "run").iterdir() if path.suffix != ".rrd"]
-    size = max(sizes) + 1000  # report.json holds times, whose digits vary
-    recording = tmp_path / "run" / "recording.rrd"
-    assert recording.stat().st_size > size
-    command = ["build", str(short), "--out", str(tmp_path / "run"), *QUICK, "--overwrite"]
-    program = f"import sys, resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size})); import modeler.cli"
-    program += "; sys.exit(modeler.cli.main(sys.argv[1:]))"
-    ended = spawned("-c", program, *command)
-    assert ended.status == 0
-    usual = ("modeler: 2 of 2 frames", "modeler: the model can be trusted")
-    said = [line for line in ended.err.splitlines() if not line.startswith(usual)]
-    assert len(said) == 1
-    assert "recording.rrd: " in said[0]
-
-
-def write_half(scene: Path, path: Path) -> Path:
-    """Write the first frames of a sequence, without colour: their model is small."""
-    frames = [replace(frame, colour=None) for frame in open_sequence(scene)][:2]
-    write_bop(path, frames, depth_scale_mm=1.0)
-    return path
-
-
-def test_a_texture_is_exported_from_the_frames_of_a_run(built: Path, tmp_path: Path) -> None:
-    small = ["--texture-px", "256", "--triangles", "800"]
-    assert main(["export", str(built), "--out", str(tmp_path / "m.obj"), "--texture", *small]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"m.obj", "m.obj.pose.json", "m.mtl", "m.png", "m_seen.png"}
 
 
 @pytest.mark.parametrize("name", ["m.ply", "m.obj"])

@@ -230,11 +230,17 @@ def test_masks_count_from_the_middle_of_their_range(
     assert any("brighter half" in note for note in sequence.notes) == ("labels" not in kind)
 
 
-def test_cut_out_objects_are_masks(tmp_path: Path, frames: list[Frame]) -> None:
+@pytest.mark.parametrize("kind", ["cut out", "palette"])
+def test_cut_out_objects_and_labels_of_a_palette_are_masks(tmp_path: Path, frames: list[Frame], kind: str) -> None:
     mask, colour = frames[0].mask, frames[0].colour
+    assert mask is not None
     assert colour is not None
+    labels = Image.fromarray(mask.astype(np.uint8), mode="P")
+    labels.putpalette([0, 0, 0, 128, 0, 0])
+    picture = Image.fromarray(np.dstack([colour, mask.astype(np.uint8) * 255])) if kind == "cut out" else labels
     save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
-    save(tmp_path / "masks" / "0.png", np.dstack([colour, mask.astype(np.uint8) * 255]))
+    (tmp_path / "masks").mkdir()
+    picture.save(tmp_path / "masks" / "0.png")
     write_camera(tmp_path, frames[0].camera)
     np.testing.assert_array_equal(open_sequence(tmp_path).frame(0).mask, mask)
 
@@ -281,14 +287,3 @@ def test_files_of_yaml_without_a_camera_are_passed_over(tmp_path: Path, frames: 
         open_sequence(tmp_path)
     read = open_sequence(tmp_path, Overrides(intrinsics=(100.0, 101.0, 80.0, 60.0)))
     assert survey(read).cameras[0].fy == 101.0
-
-
-def test_palette_masks_are_labels(tmp_path: Path, frames: list[Frame]) -> None:
-    mask = frames[0].mask
-    save(tmp_path / "depth" / "0.png", raw_depth(frames[0], 1.0))
-    (tmp_path / "masks").mkdir()
-    labels = Image.fromarray(mask.astype(np.uint8), mode="P")
-    labels.putpalette([0, 0, 0, 128, 0, 0])
-    labels.save(tmp_path / "masks" / "0.png")
-    write_camera(tmp_path, frames[0].camera)
-    np.testing.assert_array_equal(open_sequence(tmp_path).frame(0).mask, mask)

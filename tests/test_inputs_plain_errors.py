@@ -59,12 +59,6 @@ def test_aligned_colour_is_believed(tmp_path: Path) -> None:
     assert cards(tmp_path / "s").misaligned is None
 
 
-def test_mirrored_colour_is_reported(tmp_path: Path) -> None:
-    found = cards(tmp_path / "s", mirrored=True)
-    assert found.misaligned.flip == "mirrored"
-    assert found.doubts[0].startswith("colour is mirrored")
-
-
 def test_shifted_colour_is_reported_by_how_much(tmp_path: Path) -> None:
     found = cards(tmp_path / "s", shift_px=(20.0, -12.0))
     assert not found.misaligned.flip
@@ -223,11 +217,14 @@ def test_images_packed_by_rvl_are_read(frames: list[Frame], rng: np.random.Gener
         from_rvl(b"", "bag")
 
 
-@pytest.mark.parametrize(("mirrored", "flip"), [(False, "upside down"), (True, "flipped top to bottom")])
-def test_colour_upside_down_is_reported(tmp_path: Path, *, mirrored: bool, flip: str) -> None:
-    found = cards(tmp_path / "s", upside_down=True, mirrored=mirrored)
-    assert found.misaligned.flip == flip
-    assert found.misaligned.is_sure
+@pytest.mark.parametrize(
+    ("mirrored", "upside_down", "flip"),
+    [(True, False, "mirrored"), (False, True, "upside down"), (True, True, "flipped top to bottom")],
+)
+def test_flipped_colour_is_reported(tmp_path: Path, *, mirrored: bool, upside_down: bool, flip: str) -> None:
+    found = cards(tmp_path / "s", mirrored=mirrored, upside_down=upside_down)
+    assert (found.misaligned.flip, found.misaligned.is_sure) == (flip, True)
+    assert found.doubts[0].startswith(f"colour is {flip}")
 
 
 def test_colour_without_anything_to_see_is_no_error(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -266,12 +266,3 @@ def test_a_camera_that_is_unplugged_leaves_what_it_gave(
         assert RunFolder(out).report()["complete"]
         assert (out / "model.ply").exists()
         assert len(RunFolder(out).report()["frames"]) == 3
-
-
-def test_a_camera_is_straightened() -> None:
-    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
-    lens = Lens(camera, (-0.3, 0.1))
-    assert lens.is_distorted
-    straight = lens.undistort(np.arange(64 * 48, dtype=np.uint16).reshape(48, 64))
-    assert straight[0, 0] > 0  # from further in
-    assert straight[24, 32] == 24 * 64 + 32

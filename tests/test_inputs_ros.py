@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from rosbags import rosbag1, rosbag2
 
-from modeler.cli import main
 from modeler.sequences import Overrides, open_sequence
 from modeler.sequences.lens import Lens
 from modeler.sequences.ros import messages
@@ -29,17 +28,12 @@ from studies.formats.ros_bags import COLOUR_FROM_DEPTH, START_NS, Recorder, Rig
 SUFFIXES = (".bag", ".mcap", ".db3", "")
 
 
-@pytest.fixture(scope="module")
-def frames() -> list[Frame]:
-    return small_frames(3)
-
-
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
 def test_what_was_recorded_is_read(tmp_path: Path, frames: list[Frame], suffix: str, encoding: str) -> None:
     path = Recorder(encoding).write(tmp_path / f"two boxes{suffix}", frames)
     sequence = open_sequence(path)
-    assert sequence.indices == (0, 1, 2)
+    assert sequence.indices == (0, 1, 2, 3)
     assert sequence.name == "two boxes"
     assert sequence.layout.startswith({".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(suffix, "ROS 2 bag"))
     assert sequence.depth_unit == ("1 mm (16UC1)" if encoding == "16UC1" else "m (32FC1)")
@@ -83,13 +77,6 @@ def test_packed_bags_of_ros_2_are_read(tmp_path: Path, frames: list[Frame], pack
         np.testing.assert_allclose(sequence.frame(index).depth_m, frames[index].depth_m, rtol=0, atol=1e-6)
 
 
-def test_converting_a_bag_gives_a_scene(tmp_path: Path, frames: list[Frame]) -> None:
-    path = Recorder().write(tmp_path / "s.mcap", frames)
-    assert main(["convert", str(path), "--out", str(tmp_path / "bop")]) == 0
-    for read, wrote in zip(open_sequence(tmp_path / "bop"), frames, strict=True):
-        np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=0, atol=1e-6)
-
-
 def test_colour_is_optional_and_must_be_aligned(tmp_path: Path, frames: list[Frame]) -> None:
     bare = open_sequence(Recorder(colour=None).write(tmp_path / "bare.bag", frames))
     assert bare.frame(0).colour is None
@@ -117,8 +104,7 @@ def test_images_come_in_order_of_capture_each_once(tmp_path: Path, frames: list[
     shuffled = [frames[place] for place in (1, 0, 0, 2)]
     shuffled[2] = dataclasses.replace(shuffled[2], index=9)
     sequence = open_sequence(Recorder().write(tmp_path / "s.bag", shuffled))
-    assert len(sequence) == 3
-    for read, wrote in zip(sequence, frames, strict=True):
+    for read, wrote in zip(sequence, frames[:3], strict=True):
         np.testing.assert_allclose(read.depth_m, wrote.depth_m, rtol=0, atol=1e-6)
 
 

@@ -252,12 +252,6 @@ def test_models_are_laid_on_each_other_from_any_side() -> None:
     assert all(match.score <= best.score for match in rest)
 
 
-def test_the_size_of_voxels_is_checked_before_a_build(tmp_path: Path, refusal: Callable[..., str]) -> None:
-    said = refusal("build", tmp_path, "--out", tmp_path / "run", "--voxel-m", "0")
-    assert "--voxel-m 0 is out of range" in said
-    assert not (tmp_path / "run").exists()
-
-
 def test_nothing_is_joined_into_a_folder_that_another_program_writes_to(
     runs: Runs, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:

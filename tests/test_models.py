@@ -16,6 +16,7 @@ from command_runner import Run
 
 from modeler import se3
 from modeler.experiment import Modelled, ModelScore, model_scores
+from modeler.export.reading import fault
 from modeler.fusion import Fuser, Matcher
 from modeler.sequences import bundled, open_sequence, true_mesh
 from modeler.types import Array, InputError
@@ -176,23 +177,25 @@ def test_another_sequence_is_not_taken_for_that_of_the_run(
     ],
 )
 @pytest.mark.parametrize("value", ["gone", [1.0, 2.0], {}])
-def test_a_damaged_report_is_one_line(
-    built: Path, tmp_path: Path, refusal: Callable[..., str], place: tuple[str | int, ...], value: object
-) -> None:
-    shutil.copytree(built, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd", "*.ply"))
-    path = tmp_path / "run" / "report.json"
-    report = within = json.loads(path.read_bytes())
+def test_damage_of_a_report_is_found(built: Path, place: tuple[str | int, ...], value: object) -> None:
+    report = within = json.loads((built / "report.json").read_bytes())
     for key in place[:-1]:
         within = within[key]
     if value == "gone":
         del within[place[-1]]
     else:
         within[place[-1]] = value
-    path.write_text(json.dumps(report))
-    if (place, value) in ((("poses", 1), "gone"), (("settings",), {}), (("seconds",), {})):
-        return  # which is no damage
+    harmless = (place, value) in ((("poses", 1), "gone"), (("settings",), {}), (("seconds",), {}))
+    assert (fault(report) is None) == harmless
+
+
+def test_a_damaged_report_is_one_line(built: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
+    shutil.copytree(built, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd", "*.ply"))
+    path = tmp_path / "run" / "report.json"
+    path.write_text(json.dumps(json.loads(path.read_bytes()) | {"poses": [{}]}))
     for command in (
         ["report"],
+        ["convert", "--out", tmp_path / "poses.txt"],
         ["export", "--voxel-m", "0.01", "--out", tmp_path / "m.ply"],
         ["evaluate", "--out", tmp_path],
         ["join", built, "--out", tmp_path / "joined"],

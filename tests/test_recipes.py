@@ -82,18 +82,6 @@ def test_toml_and_json_say_the_same(tmp_path: Path) -> None:
     assert replace(json_recipe, sensor=toml_recipe.sensor) == toml_recipe
 
 
-@pytest.mark.parametrize("kind", [Tabletop, Turntable])
-def test_recipes_may_say_how_much_motions_wobble(tmp_path: Path, kind: type[Tabletop | Turntable]) -> None:
-    path = tmp_path / "r.json"
-    wobble = {"kind": kind.__name__.lower(), "wobble_deg": 0.2, "wobble_m": 7e-4}
-    path.write_text(json.dumps({"object": json.loads(BOX), "trajectory": wobble}))
-    assert load_recipe(path).trajectory == kind(wobble_deg=0.2, wobble_m=7e-4)
-    truth = np.array(list(RenderedSequence(load_recipe(path)).truth().values()))
-    table_from_object = se3.inverse(Viewpoint().camera_from_table()) @ truth
-    assert 0.0 < np.degrees(np.abs(table_from_object[:, :2, 2])).max() < 1.0  # the truth is what wobbles
-    assert 0.0 < np.abs(table_from_object[:, 2, 3] - 0.05).max() < 0.003
-
-
 def test_mesh_files_are_found_beside_the_recipe(tmp_path: Path) -> None:
     (tmp_path / "part.ply").write_bytes(ply_bytes(Box((100, 100, 100)).mesh()))
     (tmp_path / "r.json").write_text('{"object": {"kind": "mesh_file", "path": "part.ply", "scale": 0.001}}')
@@ -354,23 +342,6 @@ def test_a_wobble_is_about_the_foot_and_changes_nothing_else(
     assert len(np.unique(lift_m[:, 2])) == (50 if wobble_m else 1)
     shorter = replace(trajectory, frames=20).table_from_object(np.zeros(3), np.random.default_rng(0))
     np.testing.assert_array_equal(shorter, wobbling[:20])
-
-
-def test_what_does_not_wobble_draws_the_steps_alone() -> None:
-    rng, alike = np.random.default_rng(0), np.random.default_rng(0)
-    poses = Turntable(50, 24, 0.5).table_from_object(np.zeros(3), rng)
-    turns_deg = np.degrees(se3.log(motions(poses))[:, 2])
-    np.testing.assert_allclose(turns_deg, alike.normal(24, 0.5, 49), atol=1e-9)
-    assert rng.bit_generator.state == alike.bit_generator.state
-    pushed = Tabletop(50, shift_m=0.0, wobble_deg=0.0, wobble_m=0.0)
-    rng, alike = np.random.default_rng(0), np.random.default_rng(0)
-    turns_deg = np.degrees(se3.log(motions(pushed.table_from_object(np.zeros(3), rng)))[:, 2])
-    drawn_deg = []
-    for _ in range(49):
-        drawn_deg.append(alike.normal(25, 3))
-        alike.uniform(size=2)  # the shift's direction and length
-    np.testing.assert_allclose(turns_deg, drawn_deg, atol=1e-9)
-    assert rng.bit_generator.state == alike.bit_generator.state
 
 
 def test_a_hand_turns_the_object_about_its_centre() -> None:

@@ -28,7 +28,6 @@ from modeler.sequences.rendering.recipe import (
     Recipe,
     RobotReadings,
     Table,
-    Tabletop,
     Viewpoint,
     Wall,
     load_recipe,
@@ -176,12 +175,6 @@ def test_a_seed_decides_everything_and_the_order_of_reading_nothing(name: str) -
     assert not np.array_equal(other.truth()[1], sequence.truth()[1])
 
 
-def test_another_camera_sees_the_same_motion() -> None:
-    recipe = small("box")
-    truth, plain = RenderedSequence(recipe).truth(), RenderedSequence(replace(recipe, sensor=None)).truth()
-    assert all(np.array_equal(truth[index], plain[index]) for index in truth)
-
-
 def test_colour_follows_the_object() -> None:
     recipe = Recipe(
         Compound((Part(Box((0.13, 0.075, 0.18)), rgb=(220, 60, 40)),)),
@@ -221,16 +214,6 @@ def test_what_is_rendered_is_what_is_read(tmp_path: Path) -> None:
     assert [float(line[0]) for line in lines] == [frame.time_s for frame in rendered]
     shifts_m = np.array([[float(value) for value in line[1:4]] for line in lines])
     np.testing.assert_allclose(shifts_m, [pose[:3, 3] for pose in rendered.truth().values()], atol=1e-8)
-
-
-def test_rendering_twice_gives_the_same_bytes(tmp_path: Path) -> None:
-    recipe = small("flashlight", trajectory=Tabletop(2), colour="jpg")
-    render(recipe, tmp_path / "a")
-    render(recipe, tmp_path / "b")
-    names = [path.relative_to(tmp_path / "a") for path in sorted((tmp_path / "a").rglob("*.*"))]
-    assert len(names) >= 9
-    for name in names:
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
 @pytest.mark.parametrize("name", ["box", "flashlight", "tube"])

@@ -17,12 +17,21 @@ from command_runner import Run
 from run_builders import META, made_up_steps
 
 from modeler.export import RunFolder, RunMeta, report_of, write_atomically
+from modeler.export.reading import fault
 from modeler.system import concurrency
 from modeler.types import InputError, Step
 from modeler.verdict import judged
 from studies.fuzz.special import replace_by
 
 FILES = {"trajectory.txt", "odometry.txt", "graph.g2o", "report.json", "cloud.ply", "model.ply"}
+
+
+def filled(path: Path, count: int = 4) -> RunFolder:
+    """Write a made-up run of `count` frames into a folder."""
+    run = RunFolder.open(path)
+    for step in made_up_steps(count):
+        run.write(step, META)
+    return run
 
 
 def test_run_folder_is_complete_after_the_last_step(tmp_path: Path) -> None:
@@ -43,9 +52,7 @@ def test_run_folder_is_complete_after_the_last_step(tmp_path: Path) -> None:
 
 
 def test_existing_run_is_not_written_over_unasked(tmp_path: Path) -> None:
-    run = RunFolder.open(tmp_path)
-    for step in made_up_steps():
-        run.write(step, META)
+    filled(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / ".model.ply.1234.part").write_text("half")
     before = (tmp_path / "report.json").read_bytes()
@@ -153,9 +160,7 @@ def test_a_folder_that_takes_long_to_write_is_written_less_often(
 
 def test_what_no_report_tells_of_is_not_resumed(tmp_path: Path) -> None:
     """A program that was killed at --overwrite may leave files of the earlier run; their report goes first."""
-    run = RunFolder.open(tmp_path)
-    for step in made_up_steps():
-        run.write(step, META)
+    run = filled(tmp_path)
     run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, ("views", "prior"))
     (tmp_path / "report.json").unlink()
     (tmp_path / "notes.txt").write_text("mine")
@@ -177,22 +182,9 @@ def test_a_folder_that_is_no_run_is_left_alone(tmp_path: Path, how: dict[str, bo
 
 
 def test_a_run_with_a_damaged_report_can_be_replaced(tmp_path: Path) -> None:
-    run = RunFolder.open(tmp_path)
-    for step in made_up_steps():
-        run.write(step, META)
+    run = filled(tmp_path)
     run.finish()
     (tmp_path / "report.json").write_text("{")
-    RunFolder.open(tmp_path, overwrite=True)
-    assert [path.name for path in tmp_path.iterdir()] == [".pairs"]
-
-
-def test_registrations_of_a_complete_run_go_with_the_run(tmp_path: Path) -> None:
-    run = RunFolder.open(tmp_path)
-    for step in made_up_steps(2):
-        run.write(step, META)
-    run.pairs.keep(made_up_steps()[-1].edges_so_far[0].posterior, ("views", "prior"))
-    run.finish()
-    assert [path.name for path in (tmp_path / ".pairs.done").iterdir()] == ["000005-000003-views-prior.pair"]
     RunFolder.open(tmp_path, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == [".pairs"]
 
@@ -270,32 +262,24 @@ def _an_edge_to_itself(report: dict[str, Any]) -> None:
     "damage",
     [
         _settings(sensor="a\0b"),
-        _settings(sensor="\ud800"),
         _settings(joined=["a\0", "b"], offset=3),
+        _settings(prior_args=["angle=\ud800"]),
+        _settings(**{"\ud800": {"a": ["b"]}}),
         _all_poses_without_spread,
         _a_frame_twice,
         _an_edge_to_itself,
         lambda report: report.update(sequence="\ud800"),
-        lambda report: report.update(sequence="a\0b"),
-        lambda report: report.update(prior="\ud800"),
-        lambda report: report["versions"].update(numpy="\ud800"),
         lambda report: report["versions"].update({"\ud800": "1"}),
-        _settings(prior_args=["angle=\ud800"]),
-        _settings(**{"\ud800": {"a": ["b"]}}),
         lambda report: report["reasons"].append("\ud800"),
         lambda report: report["frames"][0].update(cause="\ud800"),
         lambda report: report["edges"][0].update(reason="\ud800"),
     ],
 )
-def test_a_report_that_cannot_be_true_is_refused(
-    refusal: Callable[..., str], folder: Path, damage: Callable[[dict], None]
-) -> None:
+def test_a_report_that_cannot_be_true_is_found_out(folder: Path, damage: Callable[[dict], None]) -> None:
     report = json.loads((folder / "report.json").read_bytes())
+    assert fault(report) is None
     damage(report)
-    (folder / "report.json").write_text(json.dumps(report))
-    for command in (["report"], ["export", "--out", "m.ply"], ["convert", "--out", "poses.txt"]):
-        words = (word.replace("m.", f"{folder.parent}/m.") for word in command[1:])
-        assert "report.json" in refusal(command[0], folder, *words)
+    assert fault(report) is not None
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"schema": 1, "x": ' + "[" * 100_000 + "]" * 100_000 + "}"])

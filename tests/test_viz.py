@@ -284,11 +284,6 @@ def test_ellipsoids_are_the_covariance_as_magnified(run: list[Step], recording: 
             np.testing.assert_allclose(one["centers"][n], step.solution.trajectory[index][:3, 3], atol=1e-6)
 
 
-def test_closure_makes_the_drawn_ellipsoids_smaller(recording: Recording) -> None:
-    half_axes = drawn(recording, entities.POSITION_1_SIGMA, "half_sizes")
-    assert half_axes[COUNT - 1][-1].max() < half_axes[COUNT - 2][-1].max()
-
-
 def test_poses_before_closure_and_after_and_edges_are_magnified_alike(run: list[Step], recording: Recording) -> None:
     last, row = run[-1], COUNT - 1
     captions = [recording[path][row]["labels"][0] for path in (entities.MAGNIFICATION, entities.EDGES_MAGNIFICATION)]
