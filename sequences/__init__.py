@@ -21,11 +21,11 @@ from modeler.sequences.calibrated import RefocusedSequence as RefocusedSequence
 from modeler.sequences.calibrated import read_focal_factor as read_focal_factor
 from modeler.sequences.calibrated import read_noise as read_noise
 from modeler.sequences.intrinsics import Overrides as Overrides
+from modeler.sequences.opening import WatchLimits as WatchLimits
 from modeler.sequences.opening import open_sequence as open_sequence
+from modeler.sequences.opening import watch as watch
 from modeler.sequences.survey import Survey as Survey
 from modeler.sequences.survey import survey as survey
-from modeler.sequences.watch import WatchLimits as WatchLimits
-from modeler.sequences.watch import watch as watch
 from modeler.types import InputError
 
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.sequences.meshes import Mesh
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places, Recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, Frame
 
 

@@ -18,7 +18,7 @@ from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import VisibilityLikelihood
 from modeler.registration.visibility.sampling import AdaptiveSampler
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import AbstractRegistrar, Outcome, PoseGaussian, Posterior, RayImage, ViewPair
 from modeler.viz.figures import coverage_curves
 from studies.calibration.__main__ import panels, run

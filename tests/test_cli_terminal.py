@@ -22,7 +22,7 @@ from command_runner import BOX, QUICK, refusal_of, spawned
 
 from modeler.cli import main
 from modeler.cli.console import Console, Interrupt, as_options, endable
-from modeler.cli.info import Info
+from modeler.cli.convert import Info
 from modeler.cli.reading import reading
 from modeler.composition.compose import check_region
 from modeler.composition.options import ObjectOptions

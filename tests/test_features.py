@@ -10,7 +10,7 @@ from prior_cases import surface
 from modeler import se3
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.registration.features import FeatureMatcher, fpfh, kabsch, mutual_matches
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, rendered_views, staged
 

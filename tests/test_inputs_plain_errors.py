@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from modeler.cli import main
-from modeler.cli.info import of_the_scene
+from modeler.cli.convert import of_the_scene
 from modeler.sequences import Overrides, Survey, bundled, open_sequence, survey, write_bop
 from modeler.sequences.calibrated import AxialSequence, stretch
 from modeler.sequences.ros.messages import from_rvl

@@ -17,7 +17,7 @@ from modeler.export import RunFolder
 from modeler.sequences import CalibratedSequence, NoiseModel, Overrides, open_sequence, survey
 from modeler.sequences.lens import Lens, lens_of_model
 from modeler.sequences.live import Image, RunningCamera, begin, opened, realsense
-from modeler.sequences.ros.sequence import RosSequence
+from modeler.sequences.ros import RosSequence
 from modeler.types import Camera, Frame, InputError
 from studies.formats.image_folders import raw_depth, small_frames
 from studies.formats.recorded import realsense as recording

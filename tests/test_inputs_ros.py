@@ -17,9 +17,8 @@ from rosbags import rosbag1, rosbag2
 
 from modeler.sequences import Overrides, open_sequence
 from modeler.sequences.lens import Lens
-from modeler.sequences.ros import messages
+from modeler.sequences.ros import RosSequence, messages
 from modeler.sequences.ros.bag import zstd
-from modeler.sequences.ros.sequence import RosSequence
 from modeler.types import Camera, Frame, InputError
 from studies.formats.image_folders import small_frames, unchecked
 from studies.formats.recorded import foxglove, scene, unpacked

@@ -14,9 +14,9 @@ from modeler.cli import main
 from modeler.sequences import CalibratedSequence, NoiseModel, bundled, open_sequence, read_noise, write_bop
 from modeler.sequences.calibrated import noise_text, object_distance_m
 from modeler.sequences.noise_calibration import Calibration, borders, calibrate, pooled_px
-from modeler.sequences.rendering.depth_sensor import gaussian_field
+from modeler.sequences.rendering import RenderedSequence
+from modeler.sequences.rendering.cameras import gaussian_field
 from modeler.sequences.rendering.recipe import Tabletop, load_recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Frame, InputError
 
 FRAMES = 5

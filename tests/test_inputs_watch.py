@@ -19,11 +19,11 @@ from PIL import Image
 
 from modeler.sequences import AbstractSequence, BopSequence, Overrides, WatchLimits, open_sequence, watch, write_bop
 from modeler.sequences.base import AbstractDerived
-from modeler.sequences.watch import POLL_S, _state, arriving
+from modeler.sequences.opening import POLL_S, _state, arriving
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import small_frames, write_bundlesdf, write_tum
 
-WATCHING = sys.modules["modeler.sequences.watch"]  # of which the package has a function of the same name
+WATCHING = sys.modules["modeler.sequences.opening"]  # of which the package has a function of the same name
 QUICK = WatchLimits(idle_s=1.0, settle_s=0.2, first=2)
 
 

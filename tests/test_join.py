@@ -22,8 +22,8 @@ from modeler.fusion import Fuser, Matcher
 from modeler.graph import PoseGraph, solve
 from modeler.runs.reopening import reopened
 from modeler.sequences import BopSequence, write_bop
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Recipe, Table, Turntable, Viewpoint
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Capsule, Compound, Cylinder, Part, Sphere
 from modeler.sequences.tum import trajectory
 from modeler.types import Array, Edge, Outcome, PoseGaussian, Posterior, Segmentation, SensorNoise, Stated, Step

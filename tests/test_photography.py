@@ -13,6 +13,8 @@ from scipy.ndimage import map_coordinates
 from trimesh.visual.texture import TextureVisuals
 
 from modeler import se3
+from modeler.sequences.rendering import RenderedSequence
+from modeler.sequences.rendering.cameras import Lamp, Photography, SmoothNormals
 from modeler.sequences.rendering.labels import (
     Chart,
     Cylindrical,
@@ -25,9 +27,7 @@ from modeler.sequences.rendering.labels import (
     Unwrapped,
     gamma_coded,
 )
-from modeler.sequences.rendering.photography import Lamp, Photography, SmoothNormals
 from modeler.sequences.rendering.recipe import Place, Places, Recipe, Viewpoint, load_recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import AnyShape, Box, Cylinder, MeshFile, Sphere
 from modeler.system.pictures import linear_light
 from modeler.types import Array, InputError

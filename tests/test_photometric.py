@@ -21,8 +21,8 @@ from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility import photometric as colours
 from modeler.se3 import rows
 from modeler.sequences import bundled, open_sequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places, load_recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, Camera, Frame, InputError, Outcome, Posterior, RayImage
 from modeler.views import Sensor
 

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from modeler.cli import main
-from modeler.export.posed_images import PosedImages, with_unmeasured, write_nerfstudio
+from modeler.export.datasets import PosedImages, with_unmeasured, write_nerfstudio
 from modeler.sequences import open_sequence
 from modeler.types import Camera, Frame
 

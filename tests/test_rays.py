@@ -7,7 +7,7 @@ from modeler import se3
 from modeler.evaluation import about_point, true_motion
 from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import Camera, Frame, SensorNoise
 from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen

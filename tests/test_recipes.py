@@ -11,8 +11,8 @@ from input_errors import refused
 from slow_cases import sampled
 
 from modeler import se3
-from modeler.sequences.meshes import Mesh
-from modeler.sequences.rendering.meshes import outer_surface, ply_bytes
+from modeler.sequences.meshes import Mesh, outer_surface, ply_bytes
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import (
     Hand,
     Place,
@@ -23,7 +23,6 @@ from modeler.sequences.rendering.recipe import (
     Viewpoint,
     load_recipe,
 )
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import (
     AnyShape,
     Box,

@@ -10,7 +10,8 @@ import pytest
 from modeler import se3
 from modeler.sequences import bundled, open_sequence
 from modeler.sequences.meshes import Mesh
-from modeler.sequences.rendering.depth_sensor import (
+from modeler.sequences.rendering import RenderedSequence, render
+from modeler.sequences.rendering.cameras import (
     EXACT,
     DepthSensor,
     DisparityNoise,
@@ -32,7 +33,6 @@ from modeler.sequences.rendering.recipe import (
     Wall,
     load_recipe,
 )
-from modeler.sequences.rendering.renderer import RenderedSequence, render
 from modeler.sequences.rendering.shapes import AnyShape, Box, Compound, Part, Sphere
 from modeler.types import Camera, Frame, InputError
 from studies.calibration.specimens import load_specimen

@@ -30,9 +30,8 @@ from modeler.fusion import Symmetries
 from modeler.fusion.symmetries import Axis
 from modeler.types import Array
 from modeler.viz import entities, reader
-from modeler.viz.report import cards, run_data, write_page
+from modeler.viz.report import CHECKS, cards, rotation_words, run_data, write_page
 from modeler.viz.report.mesh import read_mesh, scene
-from modeler.viz.report.page import CHECKS, rotation_words
 from modeler.viz.report.run_data import Result, recorded, surfaces
 from modeler.viz.stream import open_stream
 
@@ -89,8 +88,8 @@ def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "modeler.viz.report.plots._svg", lambda figure: b"<svg xmlns='http://www.w3.org/2000/svg'></svg>"
     )
-    monkeypatch.setattr("modeler.viz.report.page.portrait", lambda mesh, object_from_upright, size: b"")
-    monkeypatch.setattr("modeler.viz.report.page.symmetry_section", lambda mesh, report: [])
+    monkeypatch.setattr("modeler.viz.report.portrait", lambda mesh, object_from_upright, size: b"")
+    monkeypatch.setattr("modeler.viz.report.symmetry_section", lambda mesh, report: [])
 
 
 class Elements(HTMLParser):

@@ -17,8 +17,8 @@ from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.ridge import reliability, without_chance
 from modeler.segmentation import Segmenter
 from modeler.sequences import bundled, open_sequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places, load_recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, RayImage
 from modeler.views import Sensor
 

@@ -11,7 +11,7 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration.visibility import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.search import Candidates, Search
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import Outcome
 from studies.calibration.by_camera import shown, viewed
 from studies.calibration.depth_cameras import CAMERAS

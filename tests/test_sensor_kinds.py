@@ -18,7 +18,7 @@ from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.posterior import displacement, of_multipath
 from modeler.sequences import Overrides, open_sequence
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import CALIBRATED_FOCAL, MULTIPATH, NOMINAL_FOCAL, InputError, SensorNoise
 from modeler.verdict.evidence import default_tolerance_m
 from studies.calibration.by_camera import shown, viewed

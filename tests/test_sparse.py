@@ -14,7 +14,7 @@ from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Scene, Segmenter
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import Camera, Frame, Outcome, SensorNoise, Step
 from modeler.views import Sensor
 from modeler.views.rays import closed, gap_px, measured_share, nearest_depth

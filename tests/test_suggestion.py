@@ -11,8 +11,8 @@ from modeler import se3
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline import Modeler
 from modeler.priors import PokePrior, TablePrior
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places, Recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.suggestion import Belief, Candidate, Goal, Prediction, suggest
 from modeler.suggestion.candidates import poked, pokes
 from modeler.suggestion.edge_prediction import TURNS_RAD, basins

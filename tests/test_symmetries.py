@@ -11,7 +11,7 @@ from slow_cases import quick_first
 from trimesh.transformations import random_rotation_matrix
 
 from modeler import se3
-from modeler.export.bop import symmetry_entries
+from modeler.export.datasets import symmetry_entries
 from modeler.fusion import Symmetries, SymmetryFinder
 from modeler.fusion.paint import cielab
 from modeler.types import Array, ObjectModel

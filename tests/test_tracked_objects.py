@@ -17,8 +17,8 @@ from slow_cases import quick_first
 from modeler import se3
 from modeler.kernels import planes
 from modeler.runs.known_objects import known_object
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Viewpoint
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.tracking import ModelRenderer, Tracked, Tracker
 from modeler.tracking.candidates import CandidateFinder
 from modeler.tracking.tracked import of_the_camera, of_the_model

@@ -30,9 +30,9 @@ from modeler.pipeline.state import State
 from modeler.priors import TablePrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Scene
-from modeler.sequences.rendering.depth_sensor import DepthSensor
+from modeler.sequences.rendering import RenderedSequence
+from modeler.sequences.rendering.cameras import DepthSensor
 from modeler.sequences.rendering.recipe import Recipe, Table, Tabletop, TurnedOver, Viewpoint
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Box, Capsule, Compound, Part, Sphere
 from modeler.types import (
     Array,

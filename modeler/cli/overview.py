@@ -61,11 +61,13 @@ SUMMARIES: Final = {
 }
 """The first sentence of each command's description, in the order in which help lists them."""
 _MODULES: Final = {
+    "info": "convert",
     "register": "evaluate",
     "render": "convert",
     "calibrate-sensor": "calibrate",
     "calibrate-camera": "calibrate",
     "join": "edit",
+    "suggest": "edit",
     "view": "pages",
     "report": "pages",
     "gallery": "pages",

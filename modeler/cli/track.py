@@ -17,8 +17,7 @@ from modeler.runs.compiling import compile_kernels
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from modeler.runs.known_objects import KnownObject
-    from modeler.runs.tracks import TrackFolder
+    from modeler.runs.known_objects import KnownObject, TrackFolder
     from modeler.sequences import AbstractSequence
     from modeler.tracking import Tracked, Tracker
 
@@ -67,9 +66,8 @@ class Track:
     def run(self) -> int:
         """Track the object; status 3 if a frame is left in doubt: poses.json has the reasons."""
         from modeler.export import locked
-        from modeler.runs.known_objects import known_object
+        from modeler.runs.known_objects import TrackFolder, known_object
         from modeler.runs.outputs import check_folder, run_inputs
-        from modeler.runs.tracks import TrackFolder
 
         files = [path for path in (self.model, self.sequence, self.sensor, self.camera) if path is not None]
         check_folder(self.out, run_inputs(files))
@@ -126,7 +124,7 @@ class Track:
     def _tracked(self, tracker: Tracker, frames: AbstractSequence, folder: TrackFolder) -> list[Tracked]:
         """Track the object through frames, write and show it."""
         from modeler.cli.reading import reading, while_it_lasts
-        from modeler.runs.tracks import PAGE
+        from modeler.runs.known_objects import PAGE
         from modeler.viz import blueprint, model_view
         from modeler.viz.report.track import write_track_page
         from modeler.viz.stream import open_stream

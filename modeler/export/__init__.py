@@ -1,7 +1,7 @@
 """A sink: the files of a run, complete at any moment."""
 
-from modeler.export.bop import scene_gt_info as scene_gt_info
-from modeler.export.bop import write_bop as write_bop
+from modeler.export.datasets import scene_gt_info as scene_gt_info
+from modeler.export.datasets import write_bop as write_bop
 from modeler.export.files import g2o_text as g2o_text
 from modeler.export.files import locked as locked
 from modeler.export.files import tum_text as tum_text

@@ -13,10 +13,10 @@ import numpy as np
 
 from modeler import export as files
 from modeler import se3
-from modeler.export import bop, solids
+from modeler.export import datasets, solids
+from modeler.export.datasets import PosedImages, share_within_masks, write_colmap, write_nerfstudio
 from modeler.export.mesh import TRIANGLES, Texture
 from modeler.export.placing import model_up
-from modeler.export.posed_images import PosedImages, share_within_masks, write_colmap, write_nerfstudio
 from modeler.export.usd import opened_usd, write_usd
 from modeler.fusion import Fuser, FusionVolume, Symmetries, SymmetryFinder
 from modeler.runs.outputs import check_files, check_folder, run_inputs
@@ -154,7 +154,7 @@ class Preset:
     def _outs(self) -> tuple[Path, ...]:
         """Return the files to write, except convex parts and scenes, whose number is unknown before."""
         if self.purpose == "bop":
-            return (self._bop_model, self._bop_model.with_name(bop.MODELS_INFO))
+            return (self._bop_model, self._bop_model.with_name(datasets.MODELS_INFO))
         if self.purpose in _MESHES:
             meshes = files.files_of(self._mesh, textured=self.purpose == "foundationpose")
             return (*meshes, files.pose_file(self._mesh))
@@ -407,7 +407,7 @@ def _symmetry_entries(found: Symmetries, object_from_mesh: Array) -> dict[str, A
 
     def entries(of: Symmetries) -> dict[str, Any]:
         axes = ((axis.direction, axis.point_m) for axis in of.continuous)
-        return bop.symmetry_entries(of.discrete, axes, object_from_mesh)
+        return datasets.symmetry_entries(of.discrete, axes, object_from_mesh)
 
     left, of_shape = found.with_colour, entries(found)
     if left is None:

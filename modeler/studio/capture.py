@@ -22,7 +22,7 @@ from modeler.segmentation import Scene, Segmenter
 from modeler.sequences import AbstractSequence, Overrides, WatchLimits, finest_unit_mm
 from modeler.sequences.base import FIRST
 from modeler.sequences.live import REACH_M
-from modeler.sequences.watch import arriving
+from modeler.sequences.opening import arriving
 from modeler.studio.jobs import Job
 from modeler.system.pictures import encoded
 from modeler.types import Array, BoolArray, Camera, Frame, InputError, Outcome, RayImage, Segmentation, SensorNoise

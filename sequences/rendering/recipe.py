@@ -11,9 +11,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.sequences.input_files import build, read_tree
-from modeler.sequences.rendering.depth_sensor import DepthSensor
+from modeler.sequences.rendering.cameras import DepthSensor, Photography
 from modeler.sequences.rendering.labels import Label
-from modeler.sequences.rendering.photography import Photography
 from modeler.sequences.rendering.shapes import AnyShape, placement
 from modeler.types import Array, Camera, InputError
 

@@ -14,7 +14,7 @@ from modeler.evaluation import true_motion
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.sequences import open_sequence
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import AbstractPoseDensity, Array, Outcome, RayImage
 from modeler.views import Sensor
 from studies.calibration.specimens import SPECIMENS, load_specimen

@@ -15,8 +15,8 @@ from dataclasses import replace
 from statistics import median
 from typing import Final
 
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Tabletop, load_recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.tracking import Tracker
 from modeler.views import Sensor
 from studies.results.tables import FOLDER, markdown, record

@@ -32,7 +32,7 @@ from modeler.export import write_atomically
 from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
-from modeler.sequences.rendering.renderer import RenderedSequence, surroundings
+from modeler.sequences.rendering import RenderedSequence, surroundings
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Camera, Frame, Posterior, RayImage, SensorNoise
 from modeler.views import Sensor
 from studies.calibration.depth_cameras import CAMERAS, DepthCamera, World, placed

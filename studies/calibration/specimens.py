@@ -9,8 +9,8 @@ from typing import Final, Literal, final
 
 import numpy as np
 
+from modeler.sequences.rendering.cameras import Lamp, Photography
 from modeler.sequences.rendering.labels import Faces, Label, Print
-from modeler.sequences.rendering.photography import Lamp, Photography
 from modeler.sequences.rendering.recipe import Recipe, builtin_recipes, load_recipe
 
 Half = Literal["tuning", "held-out"]

@@ -15,8 +15,8 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Recipe, Tabletop, Turntable
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import AbstractPrior, AbstractRegistrar, Array, Posterior, RayImage
 from modeler.views import Sensor
 from studies.calibration.specimens import FRAMES, SPECIMENS, Half, Specimen, Symmetry, load_specimen

@@ -25,7 +25,7 @@ from modeler.composition import compose
 from modeler.composition.compose import comes_back
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.evaluation import rotation_error_deg, translation_error_m, true_motion
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import Step
 from studies.calibration.specimens import SPECIMENS, Half, load_specimen
 from studies.calibration.study import Condition, staged

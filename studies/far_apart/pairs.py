@@ -11,7 +11,7 @@ import numpy as np
 from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import GeneralPrior
 from modeler.sequences import open_sequence
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import AbstractPoseDensity, Array, RayImage
 from studies.ablation.pairs import SHARED, recorded_views
 from studies.calibration.specimens import Half, load_specimen

@@ -16,8 +16,8 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.priors import HeldPrior
 from modeler.sequences import AbstractSequence
 from modeler.sequences.hand_shapes import HandMarkedSequence, HandShape
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Hand, Place, Places
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Box, Compound, placement
 from modeler.types import Array, HandPoses, Step
 from studies.calibration.specimens import load_specimen

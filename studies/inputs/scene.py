@@ -12,8 +12,8 @@ import numpy as np
 from modeler import se3
 from modeler.evaluation import align_to_model, rotation_error_deg, true_motion
 from modeler.sequences.meshes import Mesh
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Recipe, Table, Tabletop
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Box
 from modeler.types import Array, Frame, ObjectModel
 from studies.calibration.specimens import SPECIMENS, load_specimen, printed

@@ -22,8 +22,8 @@ from modeler.pipeline import Modeler
 from modeler.priors import TurntablePrior
 from modeler.segmentation import Scene
 from modeler.sequences import AbstractSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Turntable
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, Solution, Step
 from modeler.views import Sensor
 from studies.calibration.specimens import load_specimen

@@ -25,7 +25,7 @@ from modeler.composition.options import PriorOptions
 from modeler.export import write_atomically
 from modeler.sequences import AbstractSequence
 from modeler.sequences.meshes import Mesh
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.types import Array, Frame, SensorNoise
 from studies.calibration.by_camera import NOMINAL, chosen, refocused, shown, world_of
 from studies.calibration.depth_cameras import CAMERAS, DepthCamera

@@ -10,8 +10,8 @@ import numpy as np
 
 from modeler import sequences
 from modeler.sequences import AbstractSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, Frame
 from studies.calibration.specimens import load_specimen
 

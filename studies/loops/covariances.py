@@ -24,8 +24,8 @@ from modeler.evaluation import nees, true_motion
 from modeler.export import write_atomically
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
 from modeler.segmentation import scene_frames
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Tabletop
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, Solution, Step
 from studies.calibration.specimens import SPECIMENS, load_specimen
 from studies.loops.cases import Case

@@ -25,8 +25,8 @@ from statistics import median
 
 from modeler.batch.engines import engine
 from modeler.batch.jobs import NOTES, Job, fingerprint, write_note
+from modeler.sequences.rendering import render
 from modeler.sequences.rendering.recipe import load_recipe
-from modeler.sequences.rendering.renderer import render
 
 RECIPE = {
     "name": "small",

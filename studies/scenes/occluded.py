@@ -11,8 +11,8 @@ import numpy as np
 
 from modeler.composition import compose
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places, Recipe, Tabletop
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import Box, Compound, Part, placement
 from modeler.types import BoolArray, Step
 from studies.calibration.specimens import load_specimen

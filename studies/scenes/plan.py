@@ -11,8 +11,8 @@ from scipy import ndimage
 
 from modeler import se3
 from modeler.composition.options import PriorOptions
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places, Recipe, Table, Tabletop, Wall
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import AnyShape, Box, Capsule, Cylinder
 from modeler.types import Array, BoolArray, Frame
 from studies.calibration.specimens import load_specimen

@@ -24,8 +24,8 @@ from scipy import ndimage
 import modeler
 from modeler.export.placing import upright
 from modeler.fusion import Symmetries, SymmetryFinder
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Recipe, Turntable
-from modeler.sequences.rendering.renderer import RenderedSequence
 from studies.calibration.specimens import SPECIMENS, Specimen, load_specimen
 from studies.results.tables import FOLDER, markdown, record
 

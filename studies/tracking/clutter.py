@@ -10,11 +10,10 @@ import numpy as np
 import trimesh
 
 from modeler import se3
-from modeler.sequences.meshes import Mesh
-from modeler.sequences.rendering.depth_sensor import DepthSensor, Exposure
-from modeler.sequences.rendering.meshes import Caster, outer_surface
+from modeler.sequences.meshes import Caster, Mesh, outer_surface
+from modeler.sequences.rendering import surroundings
+from modeler.sequences.rendering.cameras import DepthSensor, Exposure
 from modeler.sequences.rendering.recipe import Viewpoint, builtin_recipes, load_recipe
-from modeler.sequences.rendering.renderer import surroundings
 from modeler.sequences.rendering.shapes import placement
 from modeler.types import Array, BoolArray, Frame, ObjectModel, SensorNoise
 from studies.calibration.specimens import load_specimen

@@ -20,7 +20,7 @@ from modeler.pipeline.pairs import prepare
 from modeler.runs.known_objects import known_object
 from modeler.segmentation import Scene as Segmented
 from modeler.sequences import open_sequence
-from modeler.sequences.rendering.renderer import RenderedSequence
+from modeler.sequences.rendering import RenderedSequence
 from modeler.tracking import Tracked, Tracker
 from modeler.types import Array, Frame, ObjectModel, PoseGaussian, RayImage
 from modeler.views import Sensor

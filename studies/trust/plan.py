@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler.composition.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
-from modeler.sequences.rendering.depth_sensor import DepthSensor
+from modeler.sequences.rendering.cameras import DepthSensor
 from modeler.sequences.rendering.recipe import Places, Recipe, Tabletop, Turntable
 from studies.calibration.specimens import SPECIMENS, Symmetry, load_specimen
 from studies.trust.faults import FAULTS, Fault

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from modeler.composition.options import PriorOptions
 from modeler.sequences import AbstractSequence
 from modeler.sequences.meshes import Mesh
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import AnyTrajectory, Place, Places, Recipe
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.types import Array, BoolArray, Frame
 
 WIDTH_PX = 320

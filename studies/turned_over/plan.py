@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from modeler.composition.options import PriorOptions
 from modeler.priors.table import WOBBLE_DEG, WOBBLE_M
+from modeler.sequences.rendering import RenderedSequence
 from modeler.sequences.rendering.recipe import Place, Places, Recipe, Tabletop, TurnedOver, Turntable
-from modeler.sequences.rendering.renderer import RenderedSequence
 from modeler.sequences.rendering.shapes import MeshFile
 from modeler.types import Array
 from studies.calibration.specimens import load_specimen

@@ -11,7 +11,7 @@ from string import Template
 from typing import Any, Final
 
 from modeler.export import write_atomically
-from modeler.viz.report.page import asset
+from modeler.viz.report import asset
 
 _SHOWN: Final = {
     "name": ("name", 1.0, ""),

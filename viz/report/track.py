@@ -13,8 +13,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.types import Array
+from modeler.viz.report import key_figures, save_page
 from modeler.viz.report.cards import outlined_card, outlined_cards, size_px, with_outline
-from modeler.viz.report.page import key_figures, save_page
 from modeler.viz.report.run_data import recorded
 
 
