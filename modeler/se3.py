@@ -103,8 +103,13 @@ def transform(pose: Array, points: Array) -> Array:
 
 def translation(offset_m: Array) -> Array:
     """Return the motion (4, 4) that only shifts by `offset_m` (3,)."""
+    return rigid(np.eye(3), offset_m)
+
+
+def rigid(rotation: Array, offset_m: Array) -> Array:
+    """Return the motion (4, 4) that rotates by a matrix (3, 3), then shifts by `offset_m` (3,)."""
     pose = np.eye(4)
-    pose[:3, 3] = offset_m
+    pose[:3, :3], pose[:3, 3] = rotation, offset_m
     return pose
 
 

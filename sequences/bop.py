@@ -51,16 +51,8 @@ def depth_scale_mm(node: Node) -> float:
 
 def camera_from_model(node: Node) -> Array:
     """Return the pose (4, 4), in m, of one object of `scene_gt.json`."""
-    entry = node.need("cam_R_m2c")
-    written = entry.numbers(9).reshape(3, 3)
-    if np.abs(written).max() > 2.0:
-        raise entry.fault("a rotation matrix, row by row")
-    left, stretch, right = np.linalg.svd(written)
-    if np.abs(stretch - 1.0).max() > 1e-2 or np.linalg.det(written) < 0.0:
-        raise entry.fault("a rotation matrix, row by row")
-    pose = se3.translation(node.need("cam_t_m2c").numbers(3) / 1000.0)
-    pose[:3, :3] = left @ right  # the rotation nearest to the rounded digits
-    return pose
+    rotation = node.need("cam_R_m2c").rotation()
+    return se3.rigid(rotation, node.need("cam_t_m2c").numbers(3) / 1000.0)
 
 
 def _occluder_names(stem: str) -> tuple[str, str]:

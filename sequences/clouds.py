@@ -22,11 +22,10 @@ from modeler.sequences.image_files import LEAST_MM, MAX_PIXELS
 from modeler.sequences.input_files import input_errors, list_images
 from modeler.sequences.intrinsics import MAX_ASPECT, Intrinsics, Overrides, find_intrinsics, sane
 from modeler.sequences.recording import AbstractRecording
-from modeler.system.regular_files import open_regular, unreadable
+from modeler.system.regular_files import PIECE_BYTES, open_regular
 from modeler.types import Array, Camera, Frame, InputError
 
 SUFFIXES = (".pcd", ".ply")
-_HEADER_BYTES = 65536  # more than headers take, comments included
 _MOST_BYTES = 1000  # a point, as text with many fields
 
 
@@ -264,11 +263,8 @@ def _window(
 
 def organised(path: Path) -> tuple[int, int]:
     """Return the (width, height) of a cloud as its header says; one row if it is not organised as an image."""
-    try:
-        with open_regular(path) as file:
-            head, size = file.read(_HEADER_BYTES), os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with input_errors(path, "cloud", "save it again"), open_regular(path) as file:
+        head, size = file.read(PIECE_BYTES), os.fstat(file.fileno()).st_size
     if path.suffix.lower() == ".pcd":
         end, width, height = r"(?m)^DATA\s+\w+", r"(?m)^WIDTH\s+(\d{1,9})\s*$", r"(?m)^HEIGHT\s+(\d{1,9})\s*$"
         count = r"(?m)^POINTS\s+(\d{1,12})\s*$"
@@ -332,9 +328,8 @@ def _fitted(points: npt.NDArray[np.float64], pixels: npt.NDArray[np.float64], pa
 def _read(path: Path) -> _Cloud:
     """Return a cloud as stored."""
     width, height = organised(path)
-    with input_errors(path, "cloud", "save it again"):
-        with open_regular(path) as file:
-            points, colours = (_read_pcd if path.suffix.lower() == ".pcd" else _read_ply)(file)
+    with input_errors(path, "cloud", "save it again"), open_regular(path) as file:
+        points, colours = (_read_pcd if path.suffix.lower() == ".pcd" else _read_ply)(file)
     if points.shape != (width * height, 3):
         raise InputError(f"{path}: is cut off or broken, {len(points)} points could be read; save it again.")
     points = np.where(np.isfinite(points) & (np.abs(points) < 1e9), points, np.nan)
@@ -359,7 +354,7 @@ def _image_coordinates(path: Path) -> npt.NDArray[np.float64] | None:
     if path.suffix.lower() != ".pcd":
         return None
     with input_errors(path, "cloud", "save it again"), open_regular(path) as file:
-        if re.search(rb"(?m)^FIELDS\b.* imX imY\b", file.read(_HEADER_BYTES)) is None:
+        if re.search(rb"(?m)^FIELDS\b.* imX imY\b", file.read(PIECE_BYTES)) is None:
             return None
         import open3d as o3d
 

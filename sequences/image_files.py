@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from PIL import Image
 
 from modeler.sequences.input_files import entries, input_errors
 from modeler.system.processes import diverted
-from modeler.system.regular_files import open_regular, unreadable
+from modeler.system.regular_files import open_regular
 from modeler.types import BoolArray, InputError
 
 MAX_PIXELS = 50_000_000
@@ -65,18 +65,9 @@ def open_image(path: Path | EmbeddedImage, formats: tuple[str, ...]) -> Image.Im
         raise InputError(f"{path}: is not a readable {wanted} image ({why}); replace it.") from None
 
 
-@contextlib.contextmanager
-def _stream(path: Path | EmbeddedImage) -> Iterator[IO[bytes]]:
+def _stream(path: Path | EmbeddedImage) -> BinaryIO:
     """Open an image for reading."""
-    if isinstance(path, EmbeddedImage):
-        yield io.BytesIO(path.content)
-        return
-    try:
-        stream = open_regular(path)
-    except OSError as error:
-        raise unreadable(path, error) from None
-    with stream:
-        yield stream
+    return io.BytesIO(path.content) if isinstance(path, EmbeddedImage) else open_regular(path)
 
 
 @contextlib.contextmanager
@@ -236,13 +227,8 @@ def read_depth(path: Path | EmbeddedImage) -> RawDepth:
     suffix = path.suffix.lower() if isinstance(path, Path) else ""
     reader = {".pgm": _read_pgm, ".exr": _read_exr, ".npy": _read_npy, ".npz": _read_npz}.get(suffix)
     if reader is not None and isinstance(path, Path):
-        with input_errors(path, f"{suffix[1:].upper()} file", "replace it"):
-            try:
-                file = open_regular(path)
-            except OSError as error:
-                raise unreadable(path, error) from None
-            with file:
-                return _as_depth(reader(file), path)
+        with input_errors(path, f"{suffix[1:].upper()} file", "replace it"), open_regular(path) as file:
+            return _as_depth(reader(file), path)
     image = open_image(path, ("PNG", "TIFF"))
     if image.mode not in ("I;16", "I;16B", "I", "F"):
         kind = _DEPTH_KINDS.get(image.mode, f"of mode {image.mode}")

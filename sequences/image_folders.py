@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import threading
-import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from modeler import se3
 from modeler.sequences.file_names import frame_numbers, partners, role_of, said_of_angles, stamps_s
@@ -21,7 +16,6 @@ from modeler.sequences.image_files import (
     COLOUR_SUFFIXES,
     DEPTH_SUFFIXES,
     MASK_SUFFIXES,
-    MAX_PIXELS,
     check_same_size,
     check_size,
     depth_size,
@@ -42,7 +36,6 @@ from modeler.sequences.input_files import (
     entries,
     first_folder,
     frame_number,
-    input_errors,
     is_there,
     list_images,
     read_text,
@@ -50,48 +43,9 @@ from modeler.sequences.input_files import (
 from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, cameras_of_frames, find_intrinsics
 from modeler.sequences.lens import Lens
 from modeler.sequences.recording import AbstractRecording
+from modeler.sequences.videos import Video, can_decode
 from modeler.system.processes import install_command
-from modeler.system.regular_files import check_regular
 from modeler.types import Array, Camera, Frame, InputError
-
-
-def can_decode() -> bool:
-    """Return whether the library that decodes videos is installed."""
-    return importlib.util.find_spec("av") is not None
-
-
-class Video:
-    """A video whose images are read one after the other: to go back is to begin again."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._lock, self._next = threading.Lock(), 0
-        self._images: Iterator[Any] = iter(())
-
-    def image(self, number: int) -> npt.NDArray[np.uint8] | None:
-        """Return an image, counted from 0, as RGB (h, w, 3); None if the video ends before it."""
-        with self._lock, input_errors(self.path, "video", "record it again"):
-            if number < self._next or self._next == 0:
-                self._container.seek(0)
-                self._next, self._images = 0, self._container.decode(video=0)
-            for image in self._images:
-                self._next += 1
-                if self._next > number:
-                    return np.asarray(image.to_ndarray(format="rgb24"), dtype=np.uint8)
-        return None
-
-    @cached_property
-    def _container(self) -> Any:
-        """Return the open file; it is closed when this video is forgotten."""
-        av = importlib.import_module("av")
-        check_regular(self.path)
-        container = av.open(str(self.path), mode="r")
-        weakref.finalize(self, container.close)
-        (track, *_) = container.streams.video
-        if not 0 < track.width * track.height <= MAX_PIXELS:
-            raise InputError(f"{self.path}: has {track.width} x {track.height} pixels; record it again.")
-        track.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
-        return container
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,23 +172,24 @@ class FoundImages:
     confidence: Mapping[str, Path] = field(default_factory=dict)
 
 
+def images_within(path: Path, names: tuple[str, ...], suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """Return the images, by stem, in the first of some folders that is there."""
+    folder = first_folder(path, names)
+    return {} if folder is None else list_images(folder, suffixes)
+
+
 def images_in_folders(path: Path) -> FoundImages:
     """Return the images in the folders `depth`, `rgb`, `masks` and others of such names."""
-
-    def within(names: tuple[str, ...], suffixes: tuple[str, ...]) -> dict[str, Path]:
-        folder = first_folder(path, names)
-        return {} if folder is None else list_images(folder, suffixes)
-
     folder = first_folder(path, DEPTH_FOLDERS) or path / DEPTH_FOLDERS[0]
     depth = list_images(folder, DEPTH_SUFFIXES)
     if not depth:
         raise no_depth(folder, "16-bit PNG or TIFF images")
     return FoundImages(
         depth,
-        within(COLOUR_FOLDERS, COLOUR_SUFFIXES),
-        within(MASK_FOLDERS, MASK_SUFFIXES),
-        within(OCCLUDER_FOLDERS, MASK_SUFFIXES),
-        within(CONFIDENCE_FOLDERS, MASK_SUFFIXES),
+        images_within(path, COLOUR_FOLDERS, COLOUR_SUFFIXES),
+        images_within(path, MASK_FOLDERS, MASK_SUFFIXES),
+        images_within(path, OCCLUDER_FOLDERS, MASK_SUFFIXES),
+        images_within(path, CONFIDENCE_FOLDERS, MASK_SUFFIXES),
     )
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from modeler.system.regular_files import parse_json, read_regular
+from modeler.system.regular_files import parse_json, read_regular, unreadable
 from modeler.types import Array, InputError
 
 
@@ -32,9 +32,7 @@ def input_errors(path: Path, what: str, advice: str) -> Iterator[None]:
         raise InputError(f"{path}: is no complete {what} ({short_message(error, path)}); copy all of it.") from None
     except Exception as error:  # a broken file can make a library raise anything, an OSError of its own, too
         if isinstance(error, OSError) and error.errno is not None:
-            raise InputError(
-                f"{path}: cannot be read ({error.strerror}); check the path and its permissions."
-            ) from None
+            raise unreadable(path, error) from None
         raise InputError(f"{path}: is not a readable {what} ({short_message(error, path)}); {advice}.") from None
 
 
@@ -99,10 +97,10 @@ def listed(by: Path, name: str) -> Path:
 def check_links(root: Path) -> None:
     """Refuse a folder in which a link, at whatever depth, leads out of it, whether or not the link would be read."""
 
-    def unreadable(error: OSError) -> None:
+    def closed(error: OSError) -> None:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}); check its permissions.") from None
 
-    for folder, inner, names in os.walk(root, onerror=unreadable):
+    for folder, inner, names in os.walk(root, onerror=closed):
         for name in sorted(inner + names):
             path = Path(folder) / name
             if path.is_symlink():
@@ -164,10 +162,11 @@ class Node:
         """Return the entries of an object whose keys are frame numbers."""
         found: dict[int, Node] = {}
         for key, node in self.items().items():
-            if not (key.isascii() and key.isdigit() and len(key) <= 9):
+            number = frame_number(key)
+            if number is None:
                 shown = json.dumps(key if len(key) <= 40 else key[:37] + "...")
                 raise InputError(f'{self.path}: key {shown} is not a frame number; use keys such as "0".')
-            found[int(key)] = node
+            found[number] = node
         return found
 
     def elements(self) -> list[Node]:
@@ -208,6 +207,14 @@ class Node:
         if not (math.isfinite(number) and low <= number <= high):
             raise self.fault(expected)
         return number
+
+    def rotation(self) -> Array:
+        """Return a rotation matrix (3, 3), row by row in a list: the one nearest to its rounded digits."""
+        written = self.numbers(9).reshape(3, 3)
+        left, stretch, right = np.linalg.svd(np.clip(written, -2.0, 2.0))
+        if np.abs(stretch - 1.0).max() > 1e-2 or np.linalg.det(left @ right) < 0.0:
+            raise self.fault("a rotation matrix, row by row")
+        return left @ right
 
     def numbers(self, count: int) -> Array:
         """Return a list of exactly `count` finite numbers (count,)."""

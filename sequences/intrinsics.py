@@ -217,7 +217,7 @@ def camera_of(node: Node, name: str) -> CameraFacts:
     node = next((within for key in ("cam0", *_WITHIN) if (within := _inner(node, key)) is not None), node)
     width, height = _first(node, _WIDTHS), _first(node, _HEIGHTS)
     size = None if width is None or height is None else (int(width.number(1.0, 1e5)), int(height.number(1.0, 1e5)))
-    model = next((found for key in _MODELS if (found := node.get(key)) is not None), None)
+    model = _first(node, _MODELS)
     return CameraFacts(
         _pinhole(node),
         name,
@@ -326,7 +326,7 @@ def _pinhole(node: Node) -> Intrinsics:
         corner_px = 0.5 if names[0] == "fl_x" else 0.0  # nerfstudio measures from the corner of the first pixel
         fx, fy, cx, cy = (node.need(name).number() for name in names)
         return _as_sane(node, [fx, fy, cx - corner_px, cy - corner_px])
-    entry = next((found for key in _MATRICES if (found := node.get(key)) is not None), None)
+    entry = _first(node, _MATRICES)
     if entry is None:
         raise node.fault("intrinsics, with fx, fy, cx and cy in px, or with their matrix as intrinsic_matrix")
     entry = entry if _is_row(entry) or (data := _inner(node, entry.keys[-1])) is None else data.need("data")

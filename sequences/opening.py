@@ -31,7 +31,7 @@ from modeler.sequences.live import LIBRARIES, open_camera
 from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.survey import survey
 from modeler.sequences.tum import open_tum
-from modeler.system.regular_files import check_regular
+from modeler.system.regular_files import check_regular, unreadable
 from modeler.types import Frame, InputError, checked
 
 FORMATS = (
@@ -62,7 +62,7 @@ def open_sequence(path: str | Path, overrides: Overrides | None = None) -> Abstr
         found = with_hand(_open(path, overrides))
         return AxialSequence(found) if overrides.along_ray else found
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions.") from None
+        raise unreadable(path, error) from None
 
 
 def _suggestion(path: Path) -> str:
@@ -91,7 +91,7 @@ def _open(path: Path, overrides: Overrides) -> AbstractSequence:
     if is_there(path / "report.json"):
         raise InputError(f"{path}: is the folder of a run; give the sequence it was made from, or convert its poses.")
     if path.is_file() and path.suffix.lower() == ".mkv":
-        from modeler.sequences.kinect import open_kinect
+        from modeler.sequences.videos import open_kinect
 
         return open_kinect(path, overrides)
     if path.is_file() and path.suffix.lower() == ".r3d":

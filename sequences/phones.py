@@ -21,7 +21,6 @@ from modeler.system.processes import install_command
 from modeler.system.regular_files import open_regular, parse_json
 from modeler.types import Camera, Frame, InputError
 
-ADVICE = install_command("phones")
 _AGAIN = "export it again"
 
 
@@ -66,7 +65,8 @@ class Record3DSequence(AbstractRecording):
         try:
             lzfse = importlib.import_module("lzfse")
         except ImportError:
-            raise InputError(f"{self.path}: recordings of Record3D are unpacked by lzfse; {ADVICE}") from None
+            how = install_command("phones")
+            raise InputError(f"{self.path}: recordings of Record3D are unpacked by lzfse; {how}") from None
         with input_errors(self.path, "recording", _AGAIN):
             return np.frombuffer(lzfse.decompress(self._content(name)), kind).reshape(size).copy()
 
@@ -83,14 +83,10 @@ class Record3DSequence(AbstractRecording):
     @cached_property
     def _archive(self) -> zipfile.ZipFile:
         """Return the open archive; it is closed when this recording is forgotten."""
-        return _archive_of(self.path, self)
-
-
-def _archive_of(path: Path, owner: object) -> zipfile.ZipFile:
-    with input_errors(path, "recording", _AGAIN):
-        file = open_regular(path)
-        weakref.finalize(owner, file.close)
-        return zipfile.ZipFile(file)
+        with input_errors(self.path, "recording", _AGAIN):
+            file = open_regular(self.path)
+            weakref.finalize(self, file.close)
+            return zipfile.ZipFile(file)
 
 
 def open_record3d(path: Path, overrides: Overrides) -> Record3DSequence:

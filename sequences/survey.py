@@ -17,10 +17,7 @@ from modeler.sequences.colour_alignment import Misalignment, depth_edges, misali
 from modeler.sequences.intrinsics import MAX_ASPECT
 from modeler.types import Camera, Float32Array, Frame, InputError
 
-NEAREST_M = 0.01
-FARTHEST_M = 100.0  # range of the median depth; beyond, the unit is wrong
-
-
+POSSIBLE_M = (0.01, 100.0)  # range of the median depth; beyond, the unit is wrong
 PLAUSIBLE_M = (0.1, 5.0)
 """Beyond these the median depth is refused, unless its unit is sure: cameras for close range measure from 0.07 m, and
 objects farther than 5 m are not turned."""
@@ -265,10 +262,11 @@ def _scatter(depth_m: Float32Array) -> float:
 
 def _check_unit(sequence: AbstractSequence, middle_m: float) -> None:
     """Reject depth that cannot be in its given unit."""
-    if NEAREST_M <= middle_m <= FARTHEST_M:
+    nearest_m, farthest_m = POSSIBLE_M
+    if nearest_m <= middle_m <= farthest_m:
         return
-    in_metres = middle_m < NEAREST_M and NEAREST_M <= middle_m * 1000.0 <= FARTHEST_M
-    in_millimetres = middle_m > FARTHEST_M and NEAREST_M <= middle_m / 1000.0 <= FARTHEST_M
+    in_metres = middle_m < nearest_m <= middle_m * 1000.0 <= farthest_m
+    in_millimetres = middle_m > farthest_m >= middle_m / 1000.0 >= nearest_m
     guess = "metres" if in_metres else "millimetres" if in_millimetres else "another unit"
     factor = " (1000 times the present scale)" if in_metres else " (a thousandth of it)" if in_millimetres else ""
     raise InputError(

@@ -11,8 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.sequences.image_files import MASK_SUFFIXES, depth_size
-from modeler.sequences.image_folders import OCCLUDER_FOLDERS, FrameFiles, ImageFolderSequence
-from modeler.sequences.input_files import first_folder, is_there, list_images, listed, read_text
+from modeler.sequences.image_folders import (
+    MASK_FOLDERS,
+    OCCLUDER_FOLDERS,
+    FrameFiles,
+    ImageFolderSequence,
+    images_within,
+)
+from modeler.sequences.input_files import is_there, listed, read_text
 from modeler.sequences.intrinsics import CameraFacts, Overrides, find_intrinsics
 from modeler.sequences.recording import paired
 from modeler.types import Array, InputError
@@ -27,10 +33,7 @@ def open_tum(path: Path, overrides: Overrides) -> ImageFolderSequence:
     if not depth:
         raise InputError(f"{path / 'depth.txt'}: lists no depth image; write lines 'time path'.")
     colour = _list(path / "rgb.txt", 2) if is_there(path / "rgb.txt") else []
-    folder = first_folder(path, ("mask", "masks"))
-    masks = {} if folder is None else list_images(folder, MASK_SUFFIXES)
-    occluding = first_folder(path, OCCLUDER_FOLDERS)
-    occluders = {} if occluding is None else list_images(occluding, MASK_SUFFIXES)
+    masks, occluders = (images_within(path, names, MASK_SUFFIXES) for names in (MASK_FOLDERS, OCCLUDER_FOLDERS))
     pairs, remarks = paired(depth, colour)
     files: dict[int, FrameFiles] = {}
     for index, pair in pairs.items():
@@ -87,9 +90,7 @@ def trajectory(path: Path) -> list[tuple[float, Array]]:
             raise InputError(
                 f"{path}: time {time_s:.6f} has no pose; write tx ty tz and a unit quaternion qx qy qz qw."
             )
-        pose = se3.translation(np.array(values[:3]))
-        pose[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
-        poses.append((time_s, pose))
+        poses.append((time_s, se3.rigid(Rotation.from_quat(values[3:]).as_matrix(), np.array(values[:3]))))
     return poses
 
 

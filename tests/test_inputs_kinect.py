@@ -15,8 +15,8 @@ from modeler import se3
 from modeler.cli import main
 from modeler.sequences import Overrides, open_sequence
 from modeler.sequences.input_files import Node
-from modeler.sequences.kinect import KinectSequence, Matroska, colour_from_depth, colour_lens, depth_lens
 from modeler.sequences.lens import Alignment, Lens
+from modeler.sequences.videos import KinectSequence, Matroska, colour_from_depth, colour_lens, depth_lens
 from modeler.types import Camera, InputError
 from studies.formats.kinect import HEIGHT, WIDTH, write_mkv
 from studies.formats.recorded import FOLDER, scene, unpacked
@@ -182,7 +182,7 @@ def test_images_larger_than_their_track_are_bounded(tmp_path: Path, monkeypatch:
     container.close()
     stamp = Matroska(tmp_path / "s.mkv").stamps("COLOR")[1][1]
     assert Matroska(tmp_path / "s.mkv").image("COLOR", stamp, "image 1").shape == (240, 320, 3)
-    monkeypatch.setattr("modeler.sequences.kinect.MAX_PIXELS", 64 * 48)
+    monkeypatch.setattr("modeler.sequences.videos.MAX_PIXELS", 64 * 48)
     with pytest.raises(InputError, match=r"s\.mkv: "):
         Matroska(tmp_path / "s.mkv").image("COLOR", stamp, "image 1")
 

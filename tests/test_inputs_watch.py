@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 import threading
 import time
 import tracemalloc
@@ -17,13 +16,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from modeler.sequences import AbstractSequence, BopSequence, Overrides, WatchLimits, open_sequence, watch, write_bop
+from modeler.sequences import (
+    AbstractSequence,
+    BopSequence,
+    Overrides,
+    WatchLimits,
+    open_sequence,
+    opening,
+    watch,
+    write_bop,
+)
 from modeler.sequences.base import AbstractDerived
 from modeler.sequences.opening import POLL_S, _state, arriving
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import small_frames, write_bundlesdf, write_tum
 
-WATCHING = sys.modules["modeler.sequences.opening"]  # of which the package has a function of the same name
 QUICK = WatchLimits(idle_s=1.0, settle_s=0.2, first=2)
 
 
@@ -95,7 +102,7 @@ def test_a_folder_is_opened_anew_only_once_it_has_changed(
         opened.append(path)
         return open_sequence(path, *more)
 
-    monkeypatch.setattr(WATCHING, "open_sequence", counted)
+    monkeypatch.setattr(opening, "open_sequence", counted)
     write_bop(tmp_path / "s", frames, depth_scale_mm=1.0)
     arrived = arriving(tmp_path / "s", Overrides(), QUICK, lambda: False)
     assert [frame.index for frame in arrived] == [0, 1, 2, 3, 4]
@@ -260,8 +267,8 @@ def test_a_damaged_frame_is_tried_less_and_less_often(
     damaged = tmp_path / "s" / "depth" / "000001.png"
     content = damaged.read_bytes()
     damaged.write_bytes(content[:40])
-    monkeypatch.setattr(WATCHING, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=rest))
-    monkeypatch.setattr(WATCHING, "open_sequence", noted)
+    monkeypatch.setattr(opening, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=rest))
+    monkeypatch.setattr(opening, "open_sequence", noted)
     arrived = arriving(tmp_path / "s", Overrides(), WatchLimits(idle_s=1000.0), lambda: False)
     assert [frame.index for frame in arrived] == [0, 2, 3, 4, 1]
     assert tried.count(1) <= 4 + np.log2(300.0 / POLL_S)

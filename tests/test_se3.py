@@ -43,6 +43,7 @@ def _covariance(rng: np.random.Generator, sigma_rad: float, sigma_m: float) -> s
 @LAWS
 @given(poses())
 def test_poses_are_rigid_motions(pose: se3.Array) -> None:
+    np.testing.assert_array_equal(se3.rigid(pose[:3, :3], pose[:3, 3]), pose)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-14)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0, abs=1e-14)
     np.testing.assert_array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])

@@ -214,7 +214,7 @@ class _OneFile(BaseHTTPRequestHandler):
             return
         try:
             content = open_regular(self._file)
-        except (OSError, InputError):
+        except InputError:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
         with content:

@@ -127,8 +127,7 @@ def _poses(path: Path) -> list[Candidate]:
         length = math.hypot(*numbers[3:])
         if not all(map(math.isfinite, (cost, *numbers))) or cost <= 0.0 or abs(length - 1.0) > 1e-2:
             raise InputError(f"{path}: line {number}: cost must be positive, and qx to qw a unit quaternion")
-        motion = se3.translation(np.array(numbers[:3]))
-        motion[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
+        motion = se3.rigid(Rotation.from_quat(numbers[3:]).as_matrix(), np.array(numbers[:3]))
         found.append(_reached(motion, row["name"] or f"line {number}", cost, (Pose.sigma_deg, Pose.sigma_m)))
     return found
 

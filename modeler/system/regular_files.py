@@ -34,16 +34,15 @@ def open_regular(path: Path) -> BinaryIO:
     because another program may have replaced it in between.
 
     Raises:
-        InputError: if it is anything else than a regular file.
-        OSError: if it is missing or cannot be opened.
+        InputError: if it is anything else than a regular file, missing, or cannot be opened.
     """
-    _check(path, os.stat(path).st_mode)
     try:
+        _check(path, os.stat(path).st_mode)
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except OSError as error:
         if error.errno == errno.ENXIO:  # a socket
             _check(path, stat.S_IFSOCK)
-        raise
+        raise unreadable(path, error) from None
     try:
         _check(path, os.fstat(descriptor).st_mode)
         return os.fdopen(descriptor, "rb")
@@ -58,10 +57,7 @@ def check_regular(path: Path) -> None:
     Raises:
         InputError: if it is anything else, missing, or cannot be opened.
     """
-    try:
-        open_regular(path).close()
-    except OSError as error:
-        raise unreadable(path, error) from None
+    open_regular(path).close()
 
 
 def create_regular(path: Path) -> None:

@@ -241,10 +241,8 @@ class Viewpoint:
     def camera_from_table(self) -> Array:
         """Return the pose (4, 4) of the table in camera coordinates."""
         sin, cos = np.sin(np.radians(self.elevation_deg)), np.cos(np.radians(self.elevation_deg))
-        pose = np.eye(4)
-        pose[:3, :3] = [[1.0, 0.0, 0.0], [0.0, -sin, -cos], [0.0, cos, -sin]]
-        pose[:3, 3] = np.array([0.0, 0.0, self.distance_m]) - pose[:3, :3] @ [0.0, 0.0, self.look_height_m]
-        return pose
+        rotation = np.array([[1.0, 0.0, 0.0], [0.0, -sin, -cos], [0.0, cos, -sin]])
+        return se3.rigid(rotation, np.array([0.0, 0.0, self.distance_m]) - rotation @ [0.0, 0.0, self.look_height_m])
 
 
 @dataclass(frozen=True)

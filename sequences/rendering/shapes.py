@@ -324,9 +324,7 @@ AnyShape = Box | Cylinder | Cone | Sphere | Capsule | Torus | Lathe | Extrusion 
 
 def placement(offset_m: tuple[float, float, float], rotation_deg: tuple[float, float, float]) -> Array:
     """Return the motion (4, 4) that turns about the fixed x, y and z axes, in this order, then shifts."""
-    pose = se3.translation(np.array(offset_m))
-    pose[:3, :3] = Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix()
-    return pose
+    return se3.rigid(Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix(), np.array(offset_m))
 
 
 def _sides(radius_m: float) -> int:

@@ -220,9 +220,7 @@ def transform_pose(transform: Any) -> Array | None:
     small = bool((np.abs(quaternion) < 2.0).all() and (np.abs(offset_m) < FARTHEST_M).all())  # not so of NaN
     if not small or not 0.9 < float(np.linalg.norm(quaternion)) < 1.1:
         return None
-    motion = se3.translation(offset_m)
-    motion[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    return motion
+    return se3.rigid(Rotation.from_quat(quaternion).as_matrix(), offset_m)
 
 
 def _name(frame_id: str) -> str:
@@ -292,8 +290,8 @@ def _pose(message: Any, where: str) -> Array:
     else:
         entries = _entries(message)
         # Matrices of the camera's library stand column by column.
-        pose = se3.translation(_numbers(entries.get("translation", ""), 3))
-        pose[:3, :3] = _numbers(entries.get("rotation", ""), 9).reshape(3, 3).T
+        rotation = _numbers(entries.get("rotation", ""), 9).reshape(3, 3).T
+        pose = se3.rigid(rotation, _numbers(entries.get("translation", ""), 3))
     if not se3.is_rigid(pose, tolerance=1e-3, farthest_m=10.0):  # of one device
         raise InputError(f"{where}: is no rigid motion; record it again.")
     return pose

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from modeler import se3
 from modeler.export import read_model
 from modeler.export.mesh import sigma_rgb
 from modeler.system.pictures import encoded, raycaster, tensor
@@ -174,7 +175,4 @@ def look_at(centre_m: Array, direction: Array, distance_m: float, up: Array) -> 
     forward = -np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = centre_m - distance_m * forward
-    return pose
+    return se3.rigid(np.stack([right, np.cross(forward, right), forward], axis=1), centre_m - distance_m * forward)

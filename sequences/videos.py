@@ -1,11 +1,14 @@
-"""Recordings of the Azure Kinect and of cameras that write its format (.mkv), read by the PyAV library."""
+"""What the PyAV library reads: videos of colour, and recordings of the Azure Kinect and of cameras like it (.mkv)."""
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import os
+import threading
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,8 +24,58 @@ from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
 from modeler.sequences.lens import Alignment, Lens, coefficients
 from modeler.sequences.recording import AbstractStreams, paired
 from modeler.system.processes import install_command
-from modeler.system.regular_files import MAX_BYTES, check_regular
+from modeler.system.regular_files import MAX_BYTES, check_regular, open_regular
 from modeler.types import Array, Camera, InputError
+
+
+def can_decode() -> bool:
+    """Return whether the library that decodes videos is installed."""
+    return importlib.util.find_spec("av") is not None
+
+
+def _opened(path: Path, owner: object) -> Any:
+    """Return an open file, which is closed when its owner is forgotten."""
+    av = importlib.import_module("av")
+    check_regular(path)
+    container = av.open(str(path), mode="r")
+    weakref.finalize(owner, container.close)
+    return container
+
+
+def _limit(track: Any, where: str) -> None:
+    """Refuse a track whose images are too large; those that claim more than it says are not decoded."""
+    if not 0 < track.width * track.height <= MAX_PIXELS:
+        raise InputError(f"{where} has {track.width} x {track.height} pixels; record it again.")
+    if not track.codec_context.is_open:
+        track.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+
+
+class Video:
+    """A video whose images are read one after the other: to go back is to begin again."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock, self._next = threading.Lock(), 0
+        self._images: Iterator[Any] = iter(())
+
+    def image(self, number: int) -> npt.NDArray[np.uint8] | None:
+        """Return an image, counted from 0, as RGB (h, w, 3); None if the video ends before it."""
+        with self._lock, input_errors(self.path, "video", "record it again"):
+            if number < self._next or self._next == 0:
+                self._container.seek(0)
+                self._next, self._images = 0, self._container.decode(video=0)
+            for image in self._images:
+                self._next += 1
+                if self._next > number:
+                    return np.asarray(image.to_ndarray(format="rgb24"), dtype=np.uint8)
+        return None
+
+    @cached_property
+    def _container(self) -> Any:
+        container = _opened(self.path, self)
+        _limit(container.streams.video[0], f"{self.path}:")
+        return container
+
 
 DEPTH, COLOUR = "CALIBRATION_CameraPurposeDepth", "CALIBRATION_CameraPurposePhotoVideo"
 Size = tuple[int, int]
@@ -79,12 +132,8 @@ def _lens(calibration: Node, purpose: str, size: Size, sensor: Size, corner: Siz
 
 def _camera_from_device(calibration: Node, purpose: str) -> Array:
     entry = _camera(calibration, purpose).need("Rt")
-    rotation = entry.need("Rotation").numbers(9).reshape(3, 3)
-    if np.abs(rotation).max() > 2.0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        raise entry.need("Rotation").fault("a rotation matrix, row by row")
-    pose = se3.translation(entry.need("Translation").numbers(3))
-    pose[:3, :3] = rotation
-    return pose
+    rotation = entry.need("Rotation").rotation()
+    return se3.rigid(rotation, entry.need("Translation").numbers(3))
 
 
 def _camera(calibration: Node, purpose: str) -> Node:
@@ -94,7 +143,6 @@ def _camera(calibration: Node, purpose: str) -> Node:
     raise InputError(f"{calibration.path}: its calibration knows no {purpose}; record it again.")
 
 
-ADVICE = install_command("kinect")
 _AGAIN = "record or copy it again"
 
 
@@ -158,7 +206,7 @@ def open_kinect(path: Path, overrides: Overrides) -> KinectSequence:
 
 def _check_whole(path: Path) -> None:
     """Reject a file whose end was never written, as after a disk was full: the library would look for images in it."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         size = file.seek(0, os.SEEK_END)
         hole_bytes = size - os.lseek(file.fileno(), 0, getattr(os, "SEEK_HOLE", os.SEEK_END)) if size else 0
     if hole_bytes > MAX_BYTES:  # so many zeros the library reads in a second
@@ -223,21 +271,14 @@ class Matroska:
     def _track(self, title: str) -> Any:
         named = (track for track in self._container.streams.video if track.metadata.get("title") == title)
         track = next(named, None)
-        if track is not None and not 0 < track.width * track.height <= MAX_PIXELS:
-            raise InputError(f"{self.path}: {title} has {track.width} x {track.height} pixels; record it again.")
-        if track is not None and not track.codec_context.is_open:  # the images may claim more than their track
-            track.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+        if track is not None:
+            _limit(track, f"{self.path}: {title}")
         return track
 
     @cached_property
     def _container(self) -> Any:
-        """Return the open file; it is closed when this recording is forgotten."""
-        try:
-            av = importlib.import_module("av")
-        except ImportError:
-            raise InputError(f"{self.path}: recordings of the Azure Kinect are read by PyAV; {ADVICE}") from None
-        check_regular(self.path)
+        if not can_decode():
+            how = install_command("kinect")
+            raise InputError(f"{self.path}: recordings of the Azure Kinect are read by PyAV; {how}")
         _check_whole(self.path)
-        container = av.open(str(self.path), mode="r")
-        weakref.finalize(self, container.close)
-        return container
+        return _opened(self.path, self)
