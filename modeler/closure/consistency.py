@@ -11,6 +11,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure.information_gain import RECENT_EDGES
 from modeler.closure.map_view import MapView, ShortestPaths, composed
+from modeler.significance import SELDOM, radius
 from modeler.types import (
     Array,
     Consistency,
@@ -175,7 +176,7 @@ class ConsistencyModel:
     """Systematic rotation error of an edge in degrees; it accumulates along a chain."""
     drift: float = 0.0004
     """Systematic translation error of an edge as a share of the object's distance; it accumulates along a chain."""
-    max_distance: float = 4.7390
+    max_distance: float = radius(SELDOM)
     """Largest Mahalanobis distance: √χ²₆(0.999), which 1 of 1000 true closures exceeds."""
     min_weight: float = 0.05
     """Least fraction (0..1) of the posterior's mass in consistent modes."""

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.fusion.alignment import Matcher, even_rotations
 from modeler.fusion.paint import Paint, SurfacePoints, cielab
+from modeler.significance import SIGMAS
 from modeler.system.pictures import raycaster, tensor
 from modeler.types import Array, BoolArray, ObjectModel, area_vectors_m2
 
@@ -88,17 +89,16 @@ class SymmetryFinder:
     Axes are the vertical, the principal axes of the surface, directions in which much of it faces and those between
     them, and directions spread evenly. Each is refined by point-to-plane ICP of the surface with itself. A rotation
     is a symmetry where fewer than `elsewhere` of the points end farther than the tolerance from the surface, and fewer
-    than `unknown` end where no surface was seen; nothing is said of what was not compared.
+    than `unknown` end where no surface was seen; nothing is said of what was not compared. The tolerance is that of the
+    distance between two places of the surface, each of which errs.
 
     Colour leaves a rotation where fewer than `repainted` of the points end farther than the tolerances of place and
     colour from all points of the surface: BOP counts symmetries that the texture does not resolve (Hodaň et al., BOP
     Challenge 2020), as far as an estimator sees them.
     """
 
-    sigmas: float = 3.0
-    """Tolerance in standard deviations of the distance between two places of the surface, each of which errs."""
     least_share: float = 0.01
-    """And at least this share of the diameter: smaller details do not help a pose estimator."""
+    """Least tolerance, as a share of the diameter: smaller details do not help a pose estimator."""
     elsewhere: float = 0.006
     """Largest share of points farther than the tolerance from the surface, which allows for outliers."""
     unknown: float = 0.1
@@ -135,7 +135,7 @@ class SymmetryFinder:
             closed: whether all of the surface was seen, so that nothing ends where it was not.
         """
         surface = _Surface.of(vertices_m, triangles, self.points, closed=closed)
-        tolerance_m = max(self.sigmas * np.sqrt(2.0) * sigma_m, self.least_share * surface.diameter_m)
+        tolerance_m = max(SIGMAS * np.sqrt(2.0) * sigma_m, self.least_share * surface.diameter_m)
         search = _Search(self, surface, tolerance_m)
         of_shape = self._of_shape(search, up)
         if colours is None:

@@ -16,12 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtri
 
 from modeler import se3
 from modeler.graph import lazy_gtsam as gtsam
-from modeler.graph.covariance import chi_square_quantile
 from modeler.graph.pose_graph import Factor, inverse_right_jacobian
 from modeler.priors.common_axis import MIN_TURN_RAD
+from modeler.significance import RARE
 from modeler.types import Array, segments
 
 Rows = Mapping[int, Array]  # by variable, blocks (m, 6) of whitened rows
@@ -33,7 +34,6 @@ _AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])
 _PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # if edges already contain the direction
 _MAX_ITERATIONS, _MAX_HALVINGS = 50, 10  # of Gauss–Newton, and of one of its steps
 _TOLERANCE = 1e-6  # of half the squared Mahalanobis distance
-_CONFIDENCE = 1.0 - 1e-6  # of the gate: one of 100 runs of 100 solutions fails by chance
 
 
 def least_variance_point(factors: Sequence[Factor]) -> Array:
@@ -176,7 +176,7 @@ class CommonAxis:
         stacked = [np.hstack(list(blocks.values())) for blocks, _ in steps]
         conditions = sum(int(np.count_nonzero(step.any(axis=1))) for step in stacked)
         conditions -= 2 * int(np.count_nonzero(free))
-        return conditions <= 0 or cost <= chi_square_quantile(_CONFIDENCE, conditions)
+        return conditions <= 0 or cost <= chdtri(conditions, RARE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import get_blas_funcs
-from scipy.special import gammaincinv
+from scipy.special import chdtri
 
 from modeler import se3
 from modeler.graph import lazy_gtsam as gtsam
@@ -195,11 +195,6 @@ class PoseCovariances(Mapping[int, Array]):
         return len(self.trajectory)
 
 
-def chi_square_quantile(probability: float, degrees: int) -> float:
-    """Return a quantile of χ²; importing `scipy.stats` instead would take 0.4 s."""
-    return 2.0 * float(gammaincinv(0.5 * degrees, probability))
-
-
 _QUANTILE = 0.16  # one standard error towards larger covariances
 _MAX_SHARE = 0.9  # of a covariance: each registration also has sampling noise
 
@@ -302,7 +297,7 @@ def variance_factor(graph: PoseGraph, solution: Solution, least: float) -> float
         least: share of the covariances that is not due to smooth errors.
     """
     distance, conditions = _distance(graph, solution)
-    return float(np.clip(distance / chi_square_quantile(_QUANTILE, conditions), least, 1.0)) if conditions > 0 else 1.0
+    return float(np.clip(distance / chdtri(conditions, 1.0 - _QUANTILE), least, 1.0)) if conditions > 0 else 1.0
 
 
 def shared_noise(graph: PoseGraph, solution: Solution, factor: float = 1.0) -> float:
@@ -320,7 +315,7 @@ def shared_noise(graph: PoseGraph, solution: Solution, factor: float = 1.0) -> f
     distance, conditions = _distance(graph, solution)
     if conditions <= 0:
         return 0.0
-    return float(np.clip(1.0 - distance / factor / chi_square_quantile(_QUANTILE, conditions), 0.0, _MAX_SHARE))
+    return float(np.clip(1.0 - distance / factor / chdtri(conditions, 1.0 - _QUANTILE), 0.0, _MAX_SHARE))
 
 
 def _distance(graph: PoseGraph, solution: Solution) -> tuple[float, int]:

@@ -15,8 +15,9 @@ import numpy as np
 from modeler import se3
 from modeler.graph.optimise import MAX_ROUNDS, Optimum, optimise
 from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes
-from modeler.graph.smoother import Smoother
+from modeler.graph.smoother import OUTLIER_DISTANCE
 from modeler.priors.proposals import PredictedProposal
+from modeler.significance import SIGMAS
 from modeler.types import AbstractPrior, Array, Edge, FocalLength, Posterior, RayImage, Solution
 from modeler.views import Sensor
 
@@ -25,7 +26,6 @@ RELIEF_ERROR = 0.008
 
 _STEP = 0.005  # of finite differences, at most a quarter of the prior's standard deviation: a few posterior ones
 _REGISTRATIONS = 5  # of the edges at most, each about the estimate so far; eight captures take one to five
-MAX_SIGMAS = 3.0  # prior standard deviations: range of the grid, and of estimates that hardly exceed the prior
 _GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
 _CONVERGED = 0.25  # standard deviations that the last registration of the edges moves the estimate
 _MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.56 to 1
@@ -63,7 +63,7 @@ class MovingGraph:
         step = min(_STEP, 0.25 * prior_sigma)
         best, curvature = prior_mean, 1.0 / prior_sigma**2
         if not all(self.at(prior_mean).inlier):  # outliers have no gradient there
-            reach = MAX_SIGMAS * prior_sigma
+            reach = SIGMAS * prior_sigma
             grid = np.linspace(prior_mean - reach, prior_mean + reach, 1 + 2 * int(np.ceil(reach / _GRID)))
             best = min(grid.tolist(), key=cost)
         for _ in range(MAX_ROUNDS if self.loops else 0):
@@ -120,7 +120,7 @@ class MovingGraph:
     @property
     def threshold(self) -> float:
         """Error in nats beyond which a loop is an outlier."""
-        return 0.5 * Smoother.outlier_distance**2
+        return 0.5 * OUTLIER_DISTANCE**2
 
     @cached_property
     def loops(self) -> int:
@@ -155,7 +155,7 @@ def estimate_focal_length(estimate_at: Callable[[float], FocalLength], *, reach:
         estimate = estimate_at(centre)
         if abs(centre - before) > estimate.sigma:  # in less, the noise of registrations would show
             share = float(np.clip((step - estimate.log_factor) / (centre - before), _MIN_SHARE, 1.0))
-    farthest = MAX_SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2)
+    farthest = SIGMAS * np.sqrt(estimate.prior_sigma**2 - estimate.sigma**2)
     if estimate.determined_by == "prior" and abs(centre) > farthest:
         # Farther from the prior's mean than such weak evidence can lead: the rounds disagree, so that an edge is wrong.
         centre, estimate = 0.0, replace(estimate, sigma=estimate.prior_sigma)
@@ -213,7 +213,7 @@ class FocalCalibrator:
             graph = MovingGraph([factor for factor in found if factor is not None], root, {})
             return graph.estimate(self.prior_sigma, -centre)
 
-        return estimate_focal_length(estimate_at, reach=MAX_SIGMAS * self.prior_sigma)
+        return estimate_focal_length(estimate_at, reach=SIGMAS * self.prior_sigma)
 
     def _registered(self, edge: Edge, made: _Made, register: Register, prior: AbstractPrior) -> Factor | None:
         """Return an edge under another focal length; None if its change is unknown.

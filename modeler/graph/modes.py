@@ -17,11 +17,11 @@ from modeler import se3
 from modeler.graph.covariance import RelativeCovariance
 from modeler.graph.optimise import optimise, selected
 from modeler.graph.pose_graph import Factor, chain, walk
+from modeler.significance import SELDOM
 from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are added one by one: all of twelve edges with two modes
 _MAX_OPTIMISED = 8  # hypotheses that are optimised
-_DECIDED = 0.9999  # weight beyond which the other modes are neglected
 _MAX_EXTRA_OUTLIERS = 1.5  # outlier loops more than the best hypothesis before one is dropped: one loop may be wrong
 
 
@@ -152,7 +152,7 @@ def select_modes(
         threshold: half the squared Mahalanobis distance from which a loop is an outlier.
         before: weights given fewer loops; modes decided there are kept.
     """
-    settled = {edge: weights for edge, weights in (before or {}).items() if weights.max() >= _DECIDED}
+    settled = {edge: weights for edge, weights in (before or {}).items() if 1.0 - weights.max() <= SELDOM}
     if not any(factor.modes and factor.edge not in settled for factor in (*tree, *loops)):
         return settled
     search = _Search.of(tree, loops, root, settled, threshold)
@@ -171,7 +171,7 @@ def select_modes(
             modes = np.arange(len(edge.posterior.modes))
             weights = (hypotheses[:, column, None] == modes).T @ shares
             top = weights == weights.max()
-            decided[edge] = top.astype(np.float64) if weights.max() >= _DECIDED else weights
+            decided[edge] = top.astype(np.float64) if 1.0 - weights.max() <= SELDOM else weights
     return decided
 
 

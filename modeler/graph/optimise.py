@@ -17,13 +17,13 @@ import numpy as np
 
 from modeler.graph import lazy_gtsam as gtsam
 from modeler.graph.pose_graph import Factor, chain
+from modeler.significance import QUORUM
 from modeler.types import Array
 
 _ANCHOR_SIGMA = 1e-6  # rad and m, of the root: far below any registration's
 _RELINEARISE = 1e-3  # rad and m from the linearisation point: relative error of a factor's residual
 _WILDFIRE = 1e-5  # changes in rad and m below which iSAM2 stops back substitution
 MAX_ROUNDS = 8  # of whatever iterates over solutions; if more are needed, the initial value was too far off
-_QUORUM = 3  # loops that agree with each other before as many new ones are tested against them alone
 
 Inlier = tuple[bool, ...]  # whether each loop takes part, in their order
 
@@ -261,7 +261,7 @@ def _continued(
     known, engine = before
     new = len(loops) - len(known)
     choices = [(True,) * new]
-    if sum(known) >= max(_QUORUM, 2 * known.count(False)) and new <= _QUORUM:
+    if sum(known) >= max(QUORUM, 2 * known.count(False)) and new <= QUORUM:
         choices = sorted(itertools.product((True, False), repeat=new), key=lambda choice: choice.count(False))
     best: tuple[float, Inlier, IncrementalSolver] | None = None
     for choice in choices:

@@ -14,7 +14,12 @@ from modeler.graph.covariance import PoseCovariances, RelativeCovariance, Shared
 from modeler.graph.modes import select_modes
 from modeler.graph.optimise import MAX_ROUNDS, IncrementalSolver, inliers, selected, solve_loops, values_of
 from modeler.graph.pose_graph import Factor, PoseGraph, SpanningTree, anchored, chain, collapse_modes, extended
+from modeler.significance import SELDOM, SIGMAS, radius
 from modeler.types import Array, Edge, FocalLength, Solution
+
+OUTLIER_DISTANCE = SIGMAS * radius(SELDOM)
+"""Mahalanobis distance of a loop edge from the solution beyond which it is an outlier: pairwise covariances may be
+optimistic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +51,6 @@ class Smoother:
     whole graph, within the tolerance of the optimisation, however it grew.
     """
 
-    outlier_distance: float = 14.2
-    """Mahalanobis distance of a loop edge from the solution beyond which it is an outlier. The default is three times
-    the 99.9 % radius of six dimensions: pairwise covariances may be optimistic."""
     shared: float = 0.0
     """Fraction (0..1) of edges' covariances that is noise of their images, the same in all edges of an image, as
     `shared_noise` estimates it."""
@@ -119,7 +121,7 @@ class Smoother:
     @property
     def _threshold(self) -> float:
         """Half the squared outlier distance."""
-        return 0.5 * self.outlier_distance**2
+        return 0.5 * OUTLIER_DISTANCE**2
 
     def _solution(
         self,
@@ -272,5 +274,5 @@ def solve(
     Raises:
         ValueError: if an accepted edge's covariance is not positive definite.
     """
-    parts = Smoother.outlier_distance, shared, common, axis, focal, common_shift_m2
+    parts = shared, common, axis, focal, common_shift_m2
     return Smoother(*parts, solution=Solution(guess)).to(graph).solution

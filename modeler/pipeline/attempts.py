@@ -22,6 +22,7 @@ from modeler.graph.focal import LIMIT_STEPS
 from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, are_apart, converged_or
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
+from modeler.significance import RARE, nats_from_mode
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -37,7 +38,7 @@ from modeler.types import (
     are_separate,
     pooled,
 )
-from modeler.verdict.evidence import TAIL_NATS, distance_nats
+from modeler.verdict.evidence import distance_nats
 
 FULL: Final = 1.0
 """Effort of a registration that may become an edge."""
@@ -170,7 +171,7 @@ def told_otherwise(prior: AbstractPrior, source: RayImage, target: RayImage, ste
         return False
     with suppress(InputError):
         density = prior.relaxed(max(steps, 2)).between(source, target)
-        return distance_nats(density, float(density.log_prior(motions).max())) > TAIL_NATS
+        return distance_nats(density, float(density.log_prior(motions).max())) > nats_from_mode(RARE)
     return False
 
 

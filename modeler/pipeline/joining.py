@@ -25,6 +25,7 @@ from modeler.priors.mixtures import KernelMixture
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.search import Search
+from modeler.significance import UNLIKELY
 from modeler.types import (
     Array,
     Edge,
@@ -48,7 +49,6 @@ _COARSE_VOXELS: Final = 64**3  # of models to align
 _MIN_ALIGNMENTS: Final = 4  # about which pairs of views are registered
 _MAX_ALIGNMENTS: Final = 24  # as many ways has a cube to match its shape, of which print tells one
 _CLOSE_NATS: Final = 10.0  # to the likeliest: registering gains a right alignment up to 5, and others are 50 below
-_TAIL: Final = 0.01  # probability of rejecting a true alignment
 MIN_JOINS: Final = 2
 """Pairs of views that must agree on an alignment: nothing confirms a single one."""
 
@@ -141,7 +141,7 @@ class Joiner:
         """
         count = min(MAX_VIEWS, len(target.frames), len(source.frames))
         freedom = count * self._independent(target, source)
-        allowed = 0.5 * (float(chdtri(freedom, _TAIL)) - freedom) / count
+        allowed = 0.5 * (float(chdtri(freedom, UNLIKELY)) - freedom) / count
         *found, shared = self._across(target, source, [alignment])[..., 0]
         *within, own = self._within(target, source)
         order = np.argsort(own, kind="stable")

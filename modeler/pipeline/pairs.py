@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -10,6 +11,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.segmentation import Scene, Segmenter
+from modeler.significance import SELDOM, UNLIKELY
 from modeler.types import (
     AbstractPairCache,
     AbstractPoseDensity,
@@ -28,13 +30,13 @@ from modeler.types import (
 )
 from modeler.views import Sensor
 
-BEYOND_LIMITS_NATS: Final = 7.0
+BEYOND_LIMITS_NATS: Final = -math.log(SELDOM)
 """Prior log odds of a motion within the prior's limits: one in a thousand exceeds them."""
 SEGMENTED: Final = (Outcome.CONVERGED, Outcome.UNSURE_MASK, Outcome.CUT_OFF)
 """Outcomes of a segmentation that has found an object."""
 _SEPARATE_RAD: Final = 0.26
 """Rotation between two modes: wider than a basin of attraction (`Search.basin`), in which descents end at one mode."""
-_CONTRADICTED_NATS: Final = 4.6
+_CONTRADICTED_NATS: Final = -math.log(UNLIKELY)
 """Log odds against a match that the images contradict: they contradict one of 100 right ones (`Posterior`)."""
 
 

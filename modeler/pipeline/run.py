@@ -33,6 +33,7 @@ from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import Placed, State
 from modeler.pipeline.still_scene import CELL, Majority
 from modeler.segmentation import Scene
+from modeler.significance import QUORUM
 from modeler.system.concurrency import prefetching
 from modeler.types import (
     BoolArray,
@@ -56,7 +57,6 @@ if TYPE_CHECKING:
     from modeler.pipeline.modeler import Modeler
 
 _FOCAL_REACH: Final = 5.0  # prior standard deviations: nominal focal lengths of captures are off by up to 4.5
-_MIN_SEGMENT: Final = 3  # frames that fit each other: two may do so by chance
 
 
 @dataclass(eq=False)
@@ -144,14 +144,14 @@ class Run:
         and after, and all frames after are lost; among these it holds.
         """
         tried: set[int] = set()
-        if any(len(frames) >= _MIN_SEGMENT for frames in self.state.lost_intervals()):  # loops first, within segments
+        if any(len(frames) >= QUORUM for frames in self.state.lost_intervals()):  # loops first, within segments
             yield from self.refine()
             self.state = self.state.with_spans()
-        while intervals := [some for some in self.state.lost_intervals() if len({*some} - tried) >= _MIN_SEGMENT]:
+        while intervals := [some for some in self.state.lost_intervals() if len({*some} - tried) >= QUORUM]:
             frames = [frame for frame in max(intervals, key=len) if frame not in tried]
             segment = yield from self._segment(frames)
             tried |= {*segment.views} if len(segment.views) > 1 else {*frames}  # two that match may be held in the air
-            if len(segment.views) >= _MIN_SEGMENT:
+            if len(segment.views) >= QUORUM:
                 yield from self._joined(segment)
 
     def refine(self) -> Iterator[Refining]:

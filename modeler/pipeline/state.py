@@ -11,6 +11,7 @@ import numpy as np
 from modeler import se3
 from modeler.closure import MapView, PathNetwork
 from modeler.graph import CommonAxis, PoseGraph, Smoother, shared_noise, variance_factor
+from modeler.graph.smoother import OUTLIER_DISTANCE
 from modeler.pipeline.pairs import Prepared
 from modeler.registration.posterior import of_multipath
 from modeler.system.disk_arrays import ViewStore
@@ -397,4 +398,4 @@ def newest_ready(views: Mapping[int, RayImage]) -> dict[int, RayImage]:
 def _same_place(before: PoseGaussian, after: PoseGaussian) -> bool:
     """Return whether registrations under two focal lengths agree, and not in different modes."""
     xi = se3.log(se3.inverse(before.mean) @ after.mean)
-    return bool(xi @ np.linalg.solve(before.covariance + after.covariance, xi) <= Smoother.outlier_distance**2)
+    return bool(xi @ np.linalg.solve(before.covariance + after.covariance, xi) <= OUTLIER_DISTANCE**2)

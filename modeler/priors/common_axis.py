@@ -10,9 +10,10 @@ from scipy.special import logsumexp
 
 from modeler import se3
 from modeler.priors.mixtures import across_axis
+from modeler.significance import QUORUM
 from modeler.types import Array, PoseGaussian, Posterior
 
-_MIN_PAIRS, _MAX_PAIRS = 3, 60  # of many, the latest suffice
+_MAX_PAIRS = 60  # of many, the latest suffice
 MIN_TURN_RAD = np.radians(5.0)  # below, a turn says little of its axis
 _FREEDOM = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
 _ITERATIONS = 30
@@ -50,7 +51,7 @@ def common_axis(motions: Sequence[PoseGaussian], wobble_rad: float, wobble_m: fl
     """
     turning = [motion for motion in motions if np.linalg.norm(se3.log(motion.mean)[:3]) >= MIN_TURN_RAD]
     turning = turning[-_MAX_PAIRS:]
-    if len(turning) < _MIN_PAIRS:
+    if len(turning) < QUORUM:
         return None
     direction, point_m = _initial_axis(turning)
     wobble = np.repeat([wobble_rad, wobble_m], 3) ** 2

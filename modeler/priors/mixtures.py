@@ -10,12 +10,12 @@ import numpy as np
 from scipy.special import i0e, i1e
 
 from modeler import se3
+from modeler.significance import UNLIKELY
 from modeler.types import AbstractPoseDensity, Array, RayImage
 from modeler.types.base import check_covariance
 
 NODES = 4097  # of a tabulated distribution function: a thousand times finer than a standard deviation
 _OVERLAP_SAMPLES = 4096  # by which the fraction of a proposal's mass within the support is estimated
-_MIN_OVERLAP = 0.01  # proposals with a smaller fraction are dropped
 
 
 def directions(count: int, rng: np.random.Generator) -> Array:
@@ -286,7 +286,7 @@ def defensive_mixture(
     """
     rng = np.random.default_rng(0)  # equal arguments give equal densities
     shares = [float(np.mean(np.isfinite(known.log_density(item.sample(_OVERLAP_SAMPLES, rng))))) for item in proposals]
-    useful = [number for number, inside in enumerate(shares) if inside >= _MIN_OVERLAP]
+    useful = [number for number, inside in enumerate(shares) if inside >= UNLIKELY]
     if not useful:
         return known
     return DefensiveMixture(

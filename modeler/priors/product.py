@@ -11,6 +11,7 @@ import numpy.typing as npt
 from modeler.priors.general import GeneralPrior
 from modeler.priors.mixtures import Alternatives, Gaussian, fitted
 from modeler.priors.table import TablePrior, support
+from modeler.significance import RARE, nats_from_mode
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -29,7 +30,6 @@ _ROUNDS = 5
 _GAUSSIAN_SHARE = 0.8
 _INFLATION = 1.3  # factor on the fitted Gaussian's standard deviations, so that weights stay bounded
 _OVERSAMPLING = 4
-_CONTRADICTION_NATS = 25.0  # seven standard deviations of a Gaussian
 
 
 @checked
@@ -131,7 +131,7 @@ def multiplied(first: AbstractPoseDensity, second: AbstractPoseDensity, centre_m
     drawn = product.sample(_FITTED, rng)
     for part in (first, second):
         usual, here = (np.median(part.log_density(poses)) for poses in (part.sample(_FITTED, rng), drawn))
-        if here < usual - _CONTRADICTION_NATS:
+        if here < usual - nats_from_mode(RARE):
             return None
     return product
 

@@ -16,10 +16,10 @@ from scipy import ndimage
 
 from modeler.kernels import planes
 from modeler.segmentation.depth_images import without_specks
+from modeler.significance import QUORUM
 from modeler.types import Array, BoolArray, Float32Array, Frame
 from modeler.views.range_noise import WIDENED_PX
 
-_LEAST_FRAMES = 3  # in which a pixel must show the background for a known colour
 _LEAST_SIGMA = 3.0  # of 255 levels: noise of a colour camera indoors
 _DARKEST, _BRIGHTEST = 0.7, 1.1  # of the background, by shadows of the object and by exposure
 _BINS = 64  # of red and of green chromaticity: a bin is three levels of a grey pixel wide
@@ -52,14 +52,14 @@ class BackgroundColour:
             masks: of the object by depth, one a frame, none of them empty.
         """
         seen = [(frame.colour, mask) for frame, mask in zip(frames, masks, strict=True) if frame.colour is not None]
-        if len(seen) < _LEAST_FRAMES:
+        if len(seen) < QUORUM:
             return None
         size = 2 * WIDENED_PX + 1
         top, bottom, left, right = planes.bounds(np.any([mask for _, mask in seen], axis=0))
         window = slice(top, bottom), slice(left, right)
         colours = np.stack([colour[window] for colour, _ in seen])
         away = np.stack([_dilated(mask, size)[window] for _, mask in seen]) == 0
-        known = np.count_nonzero(away, axis=0) >= _LEAST_FRAMES
+        known = np.count_nonzero(away, axis=0) >= QUORUM
         mean, sigma = np.zeros((*known.shape, 3), dtype=np.float32), np.zeros(known.shape, dtype=np.float32)
         shown = np.where(away[:, known, None], colours[:, known], np.float32(np.nan))
         mean[known] = _median(shown)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.special import ndtri
 
+from modeler.significance import SIGMAS
 from modeler.types import Array, BoolArray, Camera, Float32Array
 
 MOST = 0.5  # the majority of pixels, frames or a rim
@@ -51,7 +52,7 @@ class DepthNoise:
 
     def tolerance_m(self, depth_m: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return the difference beyond which two measurements at `depth_m` are two surfaces: 3 sigma plus a floor."""
-        return 3.0 * self.sigma_m(depth_m) + self.floor_m
+        return SIGMAS * self.sigma_m(depth_m) + self.floor_m
 
     def scaled(self, factor: float) -> DepthNoise:
         """Return the noise multiplied by a factor at all depths."""

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from modeler.segmentation.depth_images import MOSTLY, DepthNoise
+from modeler.significance import SIGMAS
 from modeler.types import Array, BoolArray, Float32Array, Plane
 
 Real = TypeVar("Real", bound=np.floating[Any])
@@ -18,7 +19,6 @@ Real = TypeVar("Real", bound=np.floating[Any])
 _SYSTEMATIC_TILT_RAD = 0.005
 _SYSTEMATIC_SHARE = 0.0015  # error of the plane's distance that its residuals do not show, and of the depth's scale
 _MIN_POINTS = 50  # of a plane, and of the ground seen on it
-_TRIM = 3.0  # standard deviations
 _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
 _CELL_PX = 5
 _MAX_HYPOTHESES = 200
@@ -74,7 +74,7 @@ def fit_plane(
     narrow = np.sqrt(max(np.linalg.eigvalsh(np.cov(uv.T))[0], 0.0))
     foot = centre if foot_m is None else foot_m
     systematic_m = _SYSTEMATIC_SHARE * float(np.linalg.norm(foot))
-    if narrow < max(_TRIM * residual.std(), systematic_m):
+    if narrow < max(SIGMAS * residual.std(), systematic_m):
         return None
     covariance = _sandwich(uv, residual, weight) + _warp(uv, residual, weight)
     at_foot = np.append((foot - centre) @ axes.T, 1.0)
@@ -95,7 +95,7 @@ def _trimmed(points: Array, sigma: Array, guess: Array | None) -> tuple[Array, B
         plane = np.asarray(guess, dtype=np.float64)
     inlier = np.zeros(len(points), dtype=np.bool_)
     for width in widths:
-        inlier = np.abs(heights(points, plane)) < _TRIM * width * sigma
+        inlier = np.abs(heights(points, plane)) < SIGMAS * width * sigma
         if np.count_nonzero(inlier) < _MIN_POINTS:
             return None
         plane = least_squares(points[inlier], weight[inlier])

@@ -10,11 +10,10 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import AutoPrior, GeneralPrior, TablePrior, TurntablePrior, turntable_in
+from modeler.significance import QUORUM, SIGMAS
 from modeler.types import ACCEPTED, AbstractPrior, Array, Failed, Outcome, Posterior, Reason, advice
 from modeler.verdict.evidence import MAX_UNSURE, WRONG_SHARE
 
-_SURE_STEPS: Final = 3  # least number of pairs for a measured step
-_FAR_SDS: Final = 3.0  # of what is given, beyond which what is measured contradicts it; chance in 3 of 1000 runs
 _ROUGH: Final = (
     0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
 )
@@ -80,10 +79,10 @@ def measured_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> s
         prior: of the run.
     """
     table, turns, sigma_deg = turntable_in(prior), *_sure_turns_deg(edges)
-    if table is None or len(turns) < _SURE_STEPS:
+    if table is None or len(turns) < QUORUM:
         return ""
     found_deg, stated_deg = float(np.median(np.linalg.norm(turns, axis=1))), abs(table.step_deg)
-    far_deg = _FAR_SDS * float(np.hypot(table.step_sigma_deg, sigma_deg))
+    far_deg = SIGMAS * float(np.hypot(table.step_sigma_deg, sigma_deg))
     if abs(found_deg - stated_deg) <= far_deg or (found_deg > far_deg and not _in_one_sense(turns)):
         return ""
     signed_deg = round(float(np.copysign(found_deg, table.step_deg)), 1)
@@ -161,7 +160,7 @@ def contradicted_focal_length(camera: Mapping[str, Any]) -> str:
     Args:
         camera: as in report.json.
     """
-    if (sds := camera.get("given_sds", 0.0)) <= _FAR_SDS:
+    if (sds := camera.get("given_sds", 0.0)) <= SIGMAS:
         return ""
     return (
         f"it contradicts the given one by {sds:.1f} of its standard deviations, which distances along the ray, "

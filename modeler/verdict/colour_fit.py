@@ -19,6 +19,7 @@ from scipy.special import ndtri
 from modeler import se3
 from modeler.closure.consistency import MIN_TURN_DEG
 from modeler.kernels.photometric import displaced_correlations
+from modeler.significance import RARE
 from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage, spread
 from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS
 from modeler.views import Sensor
@@ -33,7 +34,6 @@ _STRIDE: Final = 4  # every fourth point is used for the search: 12 pairs have a
 _LOGS: Final = np.log(np.arange(256) + 4.0).astype(np.float32) / 3.0  # of 8-bit values, as in registration
 _REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: baselines of 15 to 50 mm at half a metre
 _LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
-_CHANCE_SDS: Final = 5.0  # of a correlation by chance: one of 10⁶ places, where several thousand are searched
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
 AT_LEAST: Final = 0.5  # of the correlation elsewhere, and of that one: less is found by chance on few points
 _INNER: Final[WeakKeyDictionary[RayImage, BoolArray]] = WeakKeyDictionary()  # as a view is part of several pairs
@@ -307,7 +307,7 @@ class Comparison:
         times = [Displacement(frames=frames) for frames in (-1, 1) if len(self.views) > 2]
         tried += [(each, self.correlation(each, fine_px)) for each in times]
         best, found = max(tried, key=lambda each: each[1])
-        clear = found >= max(AT_LEAST, correlation + _CHANCE_SDS * chance)
+        clear = found >= max(AT_LEAST, correlation - float(ndtri(RARE)) * chance)  # of several thousand places
         # A plain object on a printed table that turns with it agrees where colour is that of the table, and before
         # scenery that stands still, under some poses, where it is that of the scenery.
         outlined = self.edges(best) > _OUTLINED * self.edges(here)

@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.special import chdtri
 
 from modeler import se3
+from modeler.significance import RARE, SELDOM, SIGMAS, radius
 from modeler.types import (
     AbstractPoseDensity,
     AbstractPrior,
@@ -29,14 +30,6 @@ from modeler.types import (
 
 MAX_UNSURE: Final = 0.5
 """Share of frames with an unsure mask: beyond, unsure masks are the rule, and another object may have been modelled."""
-MIN_MOTION_SDS: Final = 3.0
-"""Displacement of the surface in standard deviations of a pixel's range: below, no motion is detectable."""
-TAIL: Final = 1e-6
-"""Probability per pair of contradicting the prior by chance: one of 100 runs of 100 pairs."""
-TAIL_NATS: Final = 0.5 * float(chdtri(6, TAIL))
-"""Distance from the mode of a prior in nats of a Gaussian that is exceeded so seldom."""
-LOOP_TAIL: Final = 1e-3
-"""Probability that a run has such loop closure errors by chance; that of the closure gate."""
 MAX_VIOLATIONS: Final = 0.1
 """Share of a frame's surface in the free space of other frames, by more than the tolerance: a model is called wrong if
 less than 90 % of its surface lies within it of the true one."""
@@ -66,7 +59,7 @@ _MIN_COSINE: Final = 0.5  # beyond 60° range noise grows with slope
 def displacement(views: Mapping[int, RayImage], solution: Solution) -> Check | None:
     """Return the largest displacement in m of the first view's surface, as root mean square.
 
-    None for fewer than two views.
+    None for fewer than two views. Below some standard deviations of a pixel's range, no motion is detectable.
     """
     frames = [frame for frame in solution.trajectory if frame in views]
     if len(frames) < 2 or not len(views[frames[0]].points_m):
@@ -79,7 +72,7 @@ def displacement(views: Mapping[int, RayImage], solution: Solution) -> Check | N
         )
         for frame in frames[1:]
     ]
-    return Check(max(moved_m), MIN_MOTION_SDS * first.sigma_r_m, at_least=True)
+    return Check(max(moved_m), SIGMAS * first.sigma_r_m, at_least=True)
 
 
 @dataclass(frozen=True)
@@ -162,7 +155,7 @@ def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | No
     if not distances:
         return None
     edge, nats = max(distances, key=lambda found: found[1])
-    return Contradiction(edge.source, edge.target, Check(float(np.sqrt(2.0 * nats)), float(np.sqrt(2.0 * TAIL_NATS))))
+    return Contradiction(edge.source, edge.target, Check(float(np.sqrt(2.0 * nats)), radius(RARE)))
 
 
 def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
@@ -178,7 +171,7 @@ def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
     if not squared:
         return None
     freedom = 6 * len(squared)
-    return Check(sum(squared) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom)
+    return Check(sum(squared) / freedom, float(chdtri(freedom, SELDOM)) / freedom)
 
 
 def loop_check(errors: Sequence[LoopClosureError], tolerance_m: float = 0.0) -> tuple[LoopClosureError, Check] | None:
@@ -195,7 +188,7 @@ def loop_check(errors: Sequence[LoopClosureError], tolerance_m: float = 0.0) -> 
     finite = [error for error in errors if np.isfinite(error.sigmas)]
     if not finite:
         return None
-    chance = float(np.sqrt(chdtri(6, LOOP_TAIL / len(finite)) / 6.0))
+    chance = float(np.sqrt(chdtri(6, SELDOM / len(finite)) / 6.0))
     shares = [_wrong_share(error.rotation_rad, error.translation_m, tolerance_m) for error in finite]
     checks = [
         Check(error.sigmas, max(chance, error.sigmas / share)) for error, share in zip(finite, shares, strict=True)
@@ -233,7 +226,7 @@ def graph_check(
     ]
     xi = se3.log(np.stack(apart))
     whitened = np.linalg.solve(np.stack([pose.covariance for pose in poses]), xi[..., None])[..., 0]
-    value, limit = float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, LOOP_TAIL)) / freedom
+    value, limit = float(np.sum(xi * whitened)) / freedom, float(chdtri(freedom, SELDOM)) / freedom
     if views is not None:
         middles_m = [views[edge.source].centroid_m for edge in edges]
         off_m = [

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.priors.general import LARGE_DEG
+from modeler.significance import RARE, nats_from_mode
 from modeler.types import AbstractPrior, Array, Check, InputError, RayImage, components, spread
 from modeler.verdict.colour_fit import (
     AT_LEAST,
@@ -31,7 +32,7 @@ from modeler.verdict.colour_fit import (
     has_colour,
     places_in,
 )
-from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS, TAIL_NATS, TOLERANCE, pixels_of
+from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS, TOLERANCE, pixels_of
 
 _CLEAR_DEG: Final = 30.0  # largest rotation at which print of right poses agrees: twelve captures have more than half
 _FAINT: Final = 0.015**2  # variance of a logarithm: a plain body before a strong pattern shows 0.010² of it
@@ -271,6 +272,6 @@ def _has_rival(pair: Likeness, views: Mapping[int, RayImage], steps: int, prior:
     if prior is not None and len(rivals):
         with suppress(InputError):  # the prior does not apply: it was not used either
             density = (prior.unlimited() or prior).between(second, first)
-            least = float(density.log_prior(pair.motion[None])[0]) - TAIL_NATS
+            least = float(density.log_prior(pair.motion[None])[0]) - nats_from_mode(RARE)
             rivals = rivals[density.log_prior(rivals) >= least]
     return len(rivals) > 0

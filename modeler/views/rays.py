@@ -9,11 +9,11 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.kernels import planes
+from modeler.significance import UNLIKELY
 from modeler.types import BoolArray, Camera, Float32Array, Frame, Plane, RayImage, SensorNoise, checked
 from modeler.views.range_noise import RangeNoise
 
 ON_PLANE = 25.0  # measurements to which a plane is fitted
-_UNLIKELY = 0.01  # probability that random loss leaves a hole of the radius of `gap_px`
 _LEAST = 0.01  # least share; of fewer measurements no more than a few would be in reach of each other
 _WIDE_PX = 10  # grids of measurements are no coarser
 
@@ -49,11 +49,11 @@ def measured_share(measured: BoolArray, within: BoolArray | None = None) -> floa
 def gap_px(share: float) -> float:
     """Return the radius in px of the largest gaps of random loss, for a share of measured pixels.
 
-    A disc of n pixels holds no measurement with probability (1 - share)^n. Below 1 px there is nothing between
-    measurements.
+    A disc of n pixels holds no measurement with probability (1 - share)^n, which is `UNLIKELY`. Below 1 px there is
+    nothing between measurements.
     """
     share = min(max(share, _LEAST), 1.0 - 1e-6)
-    return float(np.sqrt(np.log(_UNLIKELY) / (np.pi * np.log1p(-share))))
+    return float(np.sqrt(np.log(UNLIKELY) / (np.pi * np.log1p(-share))))
 
 
 def nearest_depth(depth_m: Float32Array, measured: BoolArray, within: BoolArray, gap: float) -> Float32Array:

@@ -11,6 +11,7 @@ import numpy as np
 from modeler.kernels import point_likelihood, point_to_plane
 from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 from modeler.registration.visibility.points import OWN_RIM, FixedPattern
+from modeler.significance import SIGMAS
 from modeler.types import Array, RayImage
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class DirectedLikelihood:
         return LikelihoodParameters(
             blur_m=np.float32(np.hypot(blur_m, self._min_blur_m)),
             silhouette_px=np.float32(_SILHOUETTE_NOISE * lateral_px + blur_m * fx / self._distance_m),
-            clearance_m=np.float32(3.0 * self.image.sigma_r_m),
+            clearance_m=np.float32(SIGMAS * self.image.sigma_r_m),
             max_point_cost=np.float32(most),
             max_steep_cost=np.float32(steep),
             normal_cost=np.float32(self.model.normal_cost),

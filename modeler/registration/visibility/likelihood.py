@@ -26,12 +26,12 @@ from modeler.registration.visibility.points import (
     spread_points,
 )
 from modeler.se3 import matrices, rows
+from modeler.significance import UNLIKELY
 from modeler.types import Array, RayImage
 
 _ROUNDING_M = 1e-6  # of depths in single precision: planes without noise may match exactly
 _MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
 _DESCENT_STRIDE = 4  # every fourth point is used for descent
-_TAIL = 0.01  # probability of rejecting a true pose by eq. 6.5
 
 
 class Scores(NamedTuple):
@@ -324,7 +324,7 @@ class PairLikelihood:
         noise_m = max(self.noises_m(target_from_source, blur_m)[0], blur_m)
         surface = replace(self, colour=None).scores(target_from_source[None], noise_m, stride=1).surface
         independent = self.temper * self.points
-        return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, _TAIL)))
+        return bool(self.temper * surface[0] >= 0.5 * (independent - chdtri(independent, UNLIKELY)))
 
     def colour_matches(
         self, transform: Array, matches: Array, points: IntArray, noise: MatchNoise, *, forward: bool

@@ -16,6 +16,7 @@ import numpy as np
 
 from modeler.kernels import bands, photometric, scores
 from modeler.kernels.photometric import Colours, harmonics_of, shading_of
+from modeler.significance import SIGMAS
 from modeler.types import Array, Frame, RayImage
 
 FINEST_PX = 0.6
@@ -30,10 +31,8 @@ _BLACK = 4.0  # added to 8-bit values: below it, noise and rounding would domina
 _LOGS = (np.log(np.arange(256) + _BLACK) / 3.0).astype(np.float32)  # a third for each of three 8-bit channels
 _COARSEST_ALIGNMENT = 2  # band in which images are first aligned: a tin's print moves by more than its width
 _SHADING_POINTS = 2000  # of a view, to estimate its shading
-_EDGE_SIGMAS = 3.0  # change of shading at an edge, in standard deviations of the noise of normals
 _NORMAL_QUARTILE = 0.6745  # median magnitude of a standard normal variable
 _LEVEL = 1.0 / 255.0  # smallest change of a bright colour's logarithm in 8 bits
-_TRUNCATION = 3.0  # of a Gaussian, in standard deviations
 _CACHE: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # of `view_features`
 
 ASSUMED_RHO = 0.7
@@ -366,7 +365,7 @@ def _unshaded(layers: np.ndarray, surface: np.ndarray) -> np.ndarray:
     changes = np.abs(shading.ravel()[inside[_subset(len(inside))]])
     noise = max(float(np.median(changes)) / _NORMAL_QUARTILE, _LEVEL)
     valid = np.empty(surface.shape, dtype=np.bool_)
-    bands.subtract_shading(colours, shading, surface, np.float32(_LEVEL**2), np.float32(_EDGE_SIGMAS * noise), valid)
+    bands.subtract_shading(colours, shading, surface, np.float32(_LEVEL**2), np.float32(SIGMAS * noise), valid)
     return valid
 
 
@@ -378,8 +377,8 @@ def _halved(images: np.ndarray) -> np.ndarray:
 
 
 def _blurred(images: np.ndarray, width_px: float) -> np.ndarray:
-    """Return images (k, h, w) blurred by a Gaussian."""
-    weights = np.exp(-0.5 * (np.arange(int(_TRUNCATION * width_px + 0.5) + 1) / width_px) ** 2)
+    """Return images (k, h, w) blurred by a Gaussian, which is cut off at `SIGMAS`."""
+    weights = np.exp(-0.5 * (np.arange(int(SIGMAS * width_px + 0.5) + 1) / width_px) ** 2)
     weights /= 2.0 * weights.sum() - weights[0]
     blurred = np.empty_like(images)
     bands.blur(images, weights.astype(np.float32), blurred)
