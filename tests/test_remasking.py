@@ -9,9 +9,9 @@ from segmentation_worlds import OBJECT, World, iou
 
 from modeler import Modeler, se3
 from modeler.evaluation import rotation_error_deg
-from modeler.pipeline.correcting import LEAST_TURN_DEG, moving_along, settled, turned_deg
+from modeler.pipeline.correcting import moving_along, settled, turned_deg
 from modeler.segmentation import Scene
-from modeler.types import Refining, Searching, Step
+from modeler.types import NEAR_DEG, Refining, Searching, Step
 from modeler.views import Sensor
 
 STEP_DEG = 25.0
@@ -72,7 +72,7 @@ def test_an_arm_larger_than_the_object_is_told_from_it_by_how_far_both_turn():
     modeler = Modeler()
     run = modeler.start(modeler.segmenter.scene(frames))
     list(run.track(frames))
-    assert turned_deg(run.state.solution.trajectory) < 0.3 * LEAST_TURN_DEG
+    assert turned_deg(run.state.solution.trajectory) < 0.3 * NEAR_DEG
     list(run.correct())
     for k in range(2, 6):  # the object was registered after all
         found = run.state.solution.relative(1, k)

@@ -11,6 +11,8 @@ import numpy as np
 from modeler import se3
 from modeler.closure.information_gain import RECENT_EDGES
 from modeler.closure.map_view import MapView, ShortestPaths, composed
+from modeler.priors.proposals import INFLATION
+from modeler.registration import VisibilityRegistrar
 from modeler.significance import SELDOM, radius
 from modeler.types import (
     Array,
@@ -39,7 +41,7 @@ _MIN_CORRELATIONS = 2  # one may be of views that hardly differ
 class Thresholds:
     """Requirements on edges, of which print alone holds for that to the previous view, too (docs/method/closure.md)."""
 
-    min_overlap: float = 0.4
+    min_overlap: float = VisibilityRegistrar.min_overlap
     """Least overlap (0..1), predicted and measured."""
     max_likelihood_drop_nats: float = 40.0
     """Largest difference of the log marginal likelihood from the median of the run's edges. Right edges of captures are
@@ -170,8 +172,8 @@ class ConsistencyModel:
     covariances are inflated for the comparison.
     """
 
-    sigma_scale: float = 2.0
-    """Factor on the standard deviations of edges, which may be optimistic."""
+    sigma_scale: float = INFLATION
+    """Factor on the standard deviations of edges."""
     drift_deg: float = 0.15
     """Systematic rotation error of an edge in degrees; it accumulates along a chain."""
     drift: float = 0.0004

@@ -12,11 +12,10 @@ from scipy.special import ndtr
 
 from modeler import se3
 from modeler.closure.map_view import MapView, ShortestPaths
-from modeler.types import Array
+from modeler.types import SOME_POINTS, Array
 
 _MAX_EXACT = 6  # views whose gain is computed exactly: those with the largest bounds
 RECENT_EDGES = 20  # newest ones, whose mean covariance and median evidence are assumed for the next
-_OVERLAP_POINTS = 200  # of a view, to predict its overlap
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ class InformationGain:
         """Return the predicted fraction of a view's surface that faces the new view's camera."""
         view = self.map_view.views[frame]
         count = len(view.points_m)
-        chosen = np.linspace(0, count - 1, min(_OVERLAP_POINTS, count)).astype(int)
+        chosen = np.linspace(0, count - 1, min(SOME_POINTS, count)).astype(int)
         camera_from_frame = se3.inverse(self.expected) @ self.map_view.solution.trajectory[frame]
         points_m = se3.transform(camera_from_frame, view.points_m[chosen])
         normals = view.normals[chosen] @ camera_from_frame[:3, :3].T

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from modeler import se3
 from modeler.fusion.fuser import FusionVolume, downsampled
+from modeler.registration.visibility.search import SEPARATE_RAD
 from modeler.types import Array, ObjectModel
 
 
@@ -39,7 +40,7 @@ class Matcher:
     """ICP iterations; the largest distance of correspondences shrinks from a third of the object to a fiftieth."""
     scored: int = 40
     """Number of ICP results ranked by the views."""
-    apart_rad: float = 0.25
+    apart_rad: float = SEPARATE_RAD
     """Matches closer than this in rotation are duplicates."""
 
     def matches(

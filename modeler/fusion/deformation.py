@@ -10,9 +10,8 @@ import numpy as np
 
 from modeler import se3
 from modeler.fusion.fuser import Fuser
-from modeler.types import Array, FocalLength, ObjectModel, Solution, spread
+from modeler.types import SOME_VIEWS, Array, FocalLength, ObjectModel, Solution, spread
 
-_MAX_VIEWS: Final = 24  # spread over a run, that stand for all of its views: one every 15° of a turn
 _ROWS: Final = 1 << 13  # vertices at a time, which bounds memory
 _UPPER: Final = np.triu_indices(6)
 
@@ -26,7 +25,7 @@ def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
         model: fused under the solution's poses.
         solution: with covariances of motions; without these, poses count as exact.
     """
-    frames = spread(list(solution.trajectory), _MAX_VIEWS)
+    frames = spread(list(solution.trajectory), SOME_VIEWS)
     if model.vertex_sigmas_m is None or not (solution.focal or solution.knows_motions) or len(frames) == 0:
         return model
     shares = _shares(model, [solution.trajectory[frame] for frame in frames])

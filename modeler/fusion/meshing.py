@@ -16,6 +16,7 @@ from modeler.kernels import marching_cubes, relief, tsdf
 from modeler.types import Array, BoolArray, area_vectors_m2, areas_m2
 
 LEAST_NEIGHBOURS = 15  # of the 26 around a voxel that fill it: more than half, so that open borders do not grow
+COARSE_VOXELS = 64**3  # of models whose shape need only be about right
 FAINT = 1e-3  # weight of a voxel that is filled: known, but next to nothing against an observation
 
 

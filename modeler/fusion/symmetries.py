@@ -263,7 +263,7 @@ class _Search:
     finder: SymmetryFinder
     surface: _Surface
     tolerance_m: float
-    compared: float = field(default=1.0)
+    compared: float = Symmetries.compared
     _paint: Paint | None = None
     _colours: Array = field(default_factory=lambda: np.zeros((0, 3)))
 

@@ -9,12 +9,11 @@ from scipy.spatial import KDTree
 
 from modeler.fusion import meshing
 from modeler.fusion.depth_views import ViewBlocks
-from modeler.fusion.meshing import FAINT, DistanceField
+from modeler.fusion.meshing import COARSE_VOXELS, FAINT, DistanceField
 from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
 
 # All chosen by hand.
-CELLS = 80**3  # largest number of cells on which unseen space is classified, which bounds time
 ROUNDS = 400  # of the primal-dual iteration
 SEAM = 4  # passes over the seam between seen and unseen surface, and rings next to it that are smoothed like weak ones
 OUTVOTED = 0.1  # largest share of the views of a cell that may be wrong, for their poses err
@@ -43,7 +42,7 @@ def closed_field(field: DistanceField, seen: ViewBlocks, tau_m: float) -> Distan
     The object ends at its support plane.
     """
     grid = field.grid
-    stride = max(1, int(np.ceil((float(np.prod(grid.shape)) / CELLS) ** (1.0 / 3.0))))
+    stride = max(1, int(np.ceil((float(np.prod(grid.shape)) / COARSE_VOXELS) ** (1.0 / 3.0))))
     blocks, cell_m = -(-grid.shape // stride), stride * grid.voxel_m
     counts = [
         occupancy.observation_counts(

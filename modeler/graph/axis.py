@@ -20,6 +20,7 @@ from scipy.special import chdtri
 
 from modeler import se3
 from modeler.graph import lazy_gtsam as gtsam
+from modeler.graph.optimise import MAX_ROUNDS
 from modeler.graph.pose_graph import Factor, inverse_right_jacobian
 from modeler.priors.common_axis import MIN_TURN_RAD
 from modeler.significance import RARE
@@ -32,7 +33,6 @@ _AXIS = ord("a") << 56  # as GTSAM numbers the symbol a0: beyond all frame numbe
 # fixed; the origin's position along the axis is loosely so; the rest is practically free.
 _AXIS_SIGMAS = np.array([1.0, 1.0, 1e-4, 1.0, 1.0, 0.03])
 _PLACE_SIGMAS = np.array([0.01, 0.01, *_AXIS_SIGMAS[2:]])  # if edges already contain the direction
-_MAX_ITERATIONS, _MAX_HALVINGS = 50, 10  # of Gauss–Newton, and of one of its steps
 _TOLERANCE = 1e-6  # of half the squared Mahalanobis distance
 
 
@@ -219,14 +219,14 @@ class _Problem:
 
     def minimised(self, poses: dict[int, Array]) -> tuple[dict[int, Array], list[tuple[Rows, Array]]]:
         """Return poses and axis of least error, with their `rows`, by Gauss–Newton with step halving."""
-        rows = self.rows(poses)
-        for _ in range(_MAX_ITERATIONS):
+        rows, decrease = self.rows(poses), np.inf
+        while decrease > _TOLERANCE:
             linear = gtsam.GaussianFactorGraph()
             for blocks, error in rows:
                 linear.add(_gaussian_factor(blocks, -error))
             step = linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR).optimize()
             moved, moved_rows = poses, rows
-            for halvings in range(_MAX_HALVINGS):
+            for halvings in range(MAX_ROUNDS):
                 moved = {
                     key: pose if key == self.root else pose @ se3.exp(0.5**halvings * step.at(key))
                     for key, pose in poses.items()
@@ -238,8 +238,6 @@ class _Problem:
             if decrease < 0.0:
                 break
             poses, rows = moved, moved_rows
-            if decrease <= _TOLERANCE:
-                break
         return poses, rows
 
     def _free(self, blocks: Rows) -> Rows:

@@ -230,7 +230,7 @@ class SharedCovariance:
     """Estimate of the focal length; None: exact."""
     common_shift_m2: Array | None = None
     """(3, 3) covariance in m², in camera coordinates, of a shift of the surface in all views, added to B; None: 0."""
-    variance_factor: float = 1.0
+    variance_factor: float = Solution.variance_factor
     """On the covariances of edges; see `variance_factor`."""
 
     def __call__(self, target: int, source: int) -> Array:

@@ -25,7 +25,6 @@ RELIEF_ERROR = 0.008
 """Relative error of the depth's relief, which loops cannot distinguish from a focal length: measured (eq. 10.4)."""
 
 _STEP = 0.005  # of finite differences, at most a quarter of the prior's standard deviation: a few posterior ones
-_REGISTRATIONS = 5  # of the edges at most, each about the estimate so far; eight captures take one to five
 _GRID = 0.02  # largest spacing, in the logarithm, of starting values for Newton's method
 _CONVERGED = 0.25  # standard deviations that the last registration of the edges moves the estimate
 _MIN_SHARE = 0.3  # of the way to the optimum that a step goes: ten rendered runs have 0.56 to 1
@@ -135,6 +134,8 @@ class MovingGraph:
 def estimate_focal_length(estimate_at: Callable[[float], FocalLength], *, reach: float) -> FocalLength:
     """Return the focal length, estimated iteratively from edges registered under each estimate (method, eq. 10.5).
 
+    Eight captures take one to five estimates.
+
     The derivatives hold near the focal length of the edges only, so that first steps may be too short. The secant
     through the last two steps shows by how much.
 
@@ -145,12 +146,12 @@ def estimate_focal_length(estimate_at: Callable[[float], FocalLength], *, reach:
     """
     first = estimate = estimate_at(0.0)
     centre, share = 0.0, 1.0
-    for number in range(_REGISTRATIONS):
+    for number in range(MAX_ROUNDS):
         if not estimate.loops:  # their edges cannot be registered under the estimate
             return replace(estimate, log_factor=0.0, sigma=estimate.prior_sigma)
         before, step = centre, estimate.log_factor
         centre = float(np.clip(before + step / share, -reach, reach))
-        if abs(step) <= _CONVERGED * estimate.sigma or centre == before or number == _REGISTRATIONS - 1:
+        if abs(step) <= _CONVERGED * estimate.sigma or centre == before or number == MAX_ROUNDS - 1:
             break
         estimate = estimate_at(centre)
         if abs(centre - before) > estimate.sigma:  # in less, the noise of registrations would show

@@ -62,7 +62,7 @@ class Smoother:
     """Estimate of the focal length, whose uncertainty is added to the covariances; None: exact."""
     common_shift_m2: Array | None = None
     """(3, 3) covariance in m² of a shift of the surface common to all views; see `SharedCovariance`. None: 0."""
-    variance_factor: float = 1.0
+    variance_factor: float = Solution.variance_factor
     """On the covariances of edges; see `SharedCovariance`."""
     graph: PoseGraph = field(default_factory=PoseGraph)
     """The graph."""

@@ -22,8 +22,10 @@ from modeler.graph.focal import LIMIT_STEPS
 from modeler.pipeline.pairs import BEYOND_LIMITS_NATS, are_apart, converged_or
 from modeler.pipeline.state import State
 from modeler.priors import PredictedProposal
+from modeler.registration.posterior import MIN_MODE_SHARE
 from modeler.significance import RARE, nats_from_mode
 from modeler.types import (
+    FULL_EFFORT,
     AbstractPoseDensity,
     AbstractPrior,
     Array,
@@ -40,13 +42,9 @@ from modeler.types import (
 )
 from modeler.verdict.evidence import distance_nats
 
-FULL: Final = 1.0
-"""Effort of a registration that may become an edge."""
-
 _LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
 _MIN_OVERLAP_GAIN = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
 _UNEVEN_SHARE = 0.25  # of the way: standard deviation in the middle between two views, if the speed is uneven
-_MIN_MODE_WEIGHT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +57,8 @@ class Attempt:
     """Number of the view of the graph."""
     prior: AbstractPrior
     """Of the motion between them."""
-    effort: float = FULL
-    """Share (0..1] of the usual effort. With less than `FULL`, a match is only a reason to try with that."""
+    effort: float = FULL_EFFORT
+    """Share (0..1] of the usual effort. With less than `FULL_EFFORT`, a match is only a reason to try with that."""
     near: Array | None = None
     """(4, 4) the only mode that is asked for, if it is known roughly."""
     prefer: Prefer = field(default_factory=lambda: _newest)
@@ -81,7 +79,7 @@ class Search:
     """The view to register."""
     first: int
     """Number of the view of the graph to register it against first."""
-    least_effort: float = FULL
+    least_effort: float = FULL_EFFORT
     """Effort of the cheapest registration that the method has."""
     base: Posterior | None = None
     """The registration that placed the view, if one did."""
@@ -100,7 +98,7 @@ class Search:
                 if prior is None:
                     continue
                 attempt = Attempt(self.view, target, prior, prefer=rung.prefer)
-                if self.least_effort < FULL and self._probably_hidden:
+                if self.least_effort < FULL_EFFORT and self._probably_hidden:
                     yield replace(attempt, effort=self.least_effort, prefer=lambda search, earlier, newer: earlier)
                     if not self.made[-1].matches or self.made[-1].outcome is Outcome.AT_LIMIT:
                         continue  # nor would it place the frame with full effort
@@ -325,7 +323,7 @@ def _discounted(posterior: Posterior, density: AbstractPoseDensity) -> Posterior
         return posterior
     weights = np.array([mode.weight for mode in posterior.modes]) * np.where(inside, 1.0, np.exp(-BEYOND_LIMITS_NATS))
     weights /= weights.sum()
-    order = [int(place) for place in np.argsort(-weights, kind="stable") if weights[place] >= _MIN_MODE_WEIGHT]
+    order = [int(place) for place in np.argsort(-weights, kind="stable") if weights[place] >= MIN_MODE_SHARE]
     total = float(weights[order].sum())
     modes = tuple(Mode(float(weights[place]) / total, posterior.modes[place].pose) for place in order)
     kept = _inside(density, posterior.samples) if len(posterior.samples) else np.zeros(0, dtype=bool)

@@ -18,6 +18,7 @@ from scipy.special import chdtri
 from modeler import se3
 from modeler.closure.consistency import widest_rotation
 from modeler.fusion import Fuser, FusionVolume, Matcher, conditional_covariances
+from modeler.fusion.meshing import COARSE_VOXELS
 from modeler.graph import PoseGraph, solve
 from modeler.pipeline.pairs import Registrations
 from modeler.priors.general import AnyMotion
@@ -27,6 +28,7 @@ from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.registration.visibility.search import Search
 from modeler.significance import UNLIKELY
 from modeler.types import (
+    SOME_VIEWS,
     Array,
     Edge,
     ElsewhereThanSegments,
@@ -44,8 +46,6 @@ ALIGNMENT_SIGMA_RAD = 0.12  # standard deviation of the alignment of a model wit
 ALIGNMENT_SIGMA = 0.15  # of its shift, in units of the object's size
 _OPEN_SHARE = 0.5  # of the first: with more, the images add less than three times the information of the alignment
 _MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment; beyond, it is at another mode
-MAX_VIEWS: Final = 20  # of a segment, compared with as many of the other; of a run, with each of its views
-_COARSE_VOXELS: Final = 64**3  # of models to align
 _MIN_ALIGNMENTS: Final = 4  # about which pairs of views are registered
 _MAX_ALIGNMENTS: Final = 24  # as many ways has a cube to match its shape, of which print tells one
 _CLOSE_NATS: Final = 10.0  # to the likeliest: registering gains a right alignment up to 5, and others are 50 below
@@ -83,8 +83,8 @@ class Alignment:
     """(4, 4) object frame of the source segment to that of the target segment."""
     log_likelihood: float = 0.0
     """Mean log-likelihood in nats over all pairs of views, one of each segment."""
-    share: float = 1.0
-    """Probability (0..1), given that one of the alignments found is right."""
+    share: float = 0.0
+    """Probability (0..1), given that one of the alignments found is right, once they are weighted."""
     edges: tuple[Edge, ...] = ()
     """Pairs of views registered about it, accepted or rejected."""
     trajectory: Mapping[int, Array] | None = None
@@ -139,7 +139,7 @@ class Joiner:
         is the chance deviation of the misfits of independent measurements, as many as a pair has for each view of the
         smaller segment (method, eq. 11.2).
         """
-        count = min(MAX_VIEWS, len(target.frames), len(source.frames))
+        count = min(SOME_VIEWS, len(target.frames), len(source.frames))
         freedom = count * self._independent(target, source)
         allowed = 0.5 * (float(chdtri(freedom, UNLIKELY)) - freedom) / count
         *found, shared = self._across(target, source, [alignment])[..., 0]
@@ -171,7 +171,7 @@ class Joiner:
         scores = self.likelihoods(target, source, alignments)
         agreed = np.array([alignment.accepted >= MIN_JOINS for alignment in alignments])
         ranks = np.where(agreed | ~agreed.any(), scores, -np.inf)
-        shares = np.exp(min(MAX_VIEWS, len(target.frames), len(source.frames)) * (ranks - ranks.max()))
+        shares = np.exp(min(SOME_VIEWS, len(target.frames), len(source.frames)) * (ranks - ranks.max()))
         shares /= shares.sum()
         order = np.argsort(-ranks, kind="stable")
         return [replace(alignments[k], log_likelihood=float(scores[k]), share=float(shares[k])) for k in order]
@@ -218,7 +218,7 @@ class Joiner:
 
     def _by_models(self, target: Segment, source: Segment) -> list[Array]:
         """Return alignments (4, 4) of the models of two segments."""
-        fuser = Fuser(max_voxels=_COARSE_VOXELS)
+        fuser = Fuser(max_voxels=COARSE_VOXELS)
         volumes = target.volume(fuser), source.volume(fuser)
         models = volumes[0].model(), volumes[1].model()
         if not all(len(model.points_m) for model in models):
@@ -289,7 +289,7 @@ class Joiner:
 
     def _across(self, target: Segment, source: Segment, alignments: Sequence[Alignment]) -> Array:
         """Return as `_nats` (3, m, n) the m pairs of views, one of each segment, for n alignments."""
-        targets, sources = self._spread(target, MAX_VIEWS), self._spread(source, MAX_VIEWS)
+        targets, sources = self._spread(target, SOME_VIEWS), self._spread(source, SOME_VIEWS)
         placed = [_placed(target, source, alignment) for alignment in alignments]
         found = [
             self._nats(other, view, np.stack([se3.inverse(poses[t]) @ poses[s] for poses in placed]))
@@ -302,7 +302,7 @@ class Joiner:
         """Return as `_nats` (3, m) the m pairs of views within segments; one of zeros if there are none."""
         own = [
             self._nats(views[s], views[t], (se3.inverse(poses[t]) @ poses[s])[None])[:, 0]
-            for views, poses in ((self._spread(one, MAX_VIEWS), one.solution.trajectory) for one in segments)
+            for views, poses in ((self._spread(one, SOME_VIEWS), one.solution.trajectory) for one in segments)
             for t, s in itertools.combinations(views, 2)
         ]
         return np.stack(own, axis=1) if own else np.zeros((3, 1))

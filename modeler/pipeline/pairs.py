@@ -10,9 +10,11 @@ from typing import Final
 import numpy as np
 
 from modeler import se3
+from modeler.registration.visibility.search import SEPARATE_RAD
 from modeler.segmentation import Scene, Segmenter
 from modeler.significance import SELDOM, UNLIKELY
 from modeler.types import (
+    FULL_EFFORT,
     AbstractPairCache,
     AbstractPoseDensity,
     AbstractPrior,
@@ -34,8 +36,6 @@ BEYOND_LIMITS_NATS: Final = -math.log(SELDOM)
 """Prior log odds of a motion within the prior's limits: one in a thousand exceeds them."""
 SEGMENTED: Final = (Outcome.CONVERGED, Outcome.UNSURE_MASK, Outcome.CUT_OFF)
 """Outcomes of a segmentation that has found an object."""
-_SEPARATE_RAD: Final = 0.26
-"""Rotation between two modes: wider than a basin of attraction (`Search.basin`), in which descents end at one mode."""
 _CONTRADICTED_NATS: Final = -math.log(UNLIKELY)
 """Log odds against a match that the images contradict: they contradict one of 100 right ones (`Posterior`)."""
 
@@ -105,7 +105,7 @@ class Registrations:
         target: RayImage,
         density: AbstractPoseDensity,
         *,
-        effort: float = 1.0,
+        effort: float = FULL_EFFORT,
         near: Array | None = None,
     ) -> Posterior:
         """Return the posterior of target_from_source.
@@ -164,4 +164,4 @@ def _beaten(within: Posterior, unlimited: Posterior) -> Posterior:
 
 def are_apart(one: Posterior, other: Posterior) -> bool:
     """Return whether two registrations of a pair are at different modes."""
-    return bool(se3.rotation_angle(se3.inverse(one.pose.mean) @ other.pose.mean) > _SEPARATE_RAD)
+    return bool(se3.rotation_angle(se3.inverse(one.pose.mean) @ other.pose.mean) > SEPARATE_RAD)

@@ -16,7 +16,6 @@ from modeler.fusion import conditional_covariances, widened
 from modeler.graph import MovingGraph, estimate_focal_length
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.correcting import (
-    LEAST_TURN_DEG,
     MAX_ROUNDS,
     Realigner,
     contradicting,
@@ -36,6 +35,7 @@ from modeler.segmentation import Scene
 from modeler.significance import QUORUM
 from modeler.system.concurrency import prefetching
 from modeler.types import (
+    NEAR_DEG,
     BoolArray,
     Edge,
     FocalLength,
@@ -264,7 +264,7 @@ class Run:
         for _ in range(MAX_ROUNDS):
             poses = current.solution.trajectory
             moving = moving_along(views, current.views, poses, realigner.tolerance(current))
-            if arm := turned_deg(poses) < LEAST_TURN_DEG:  # which is larger than the object, so that it was registered
+            if arm := turned_deg(poses) < NEAR_DEG:  # which is larger than the object, so that it was registered
                 moving = {frame: mask & ~moving[frame] for frame, mask in masks_of(views).items() if frame in moving}
             if settled(moving, masks):
                 break
@@ -279,7 +279,7 @@ class Run:
                 if not isinstance(event, Step):
                     yield event
             current = other.state
-            if len(current.views) < len(before.views) or turned_deg(current.solution.trajectory) < LEAST_TURN_DEG:
+            if len(current.views) < len(before.views) or turned_deg(current.solution.trajectory) < NEAR_DEG:
                 break
             other._solve()
             again = realigner.free_space(other.state)

@@ -14,9 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from modeler import se3
-from modeler.pipeline.joining import MAX_VIEWS
 from modeler.segmentation.depth_images import point_image, without_specks
-from modeler.types import Array, BoolArray, RayImage, spread
+from modeler.types import SOME_VIEWS, Array, BoolArray, RayImage, spread
 
 CELL: Final = 0.02
 """Side of the cubes in which views of a scene are compared, as a share of the distance to which it is seen.
@@ -73,7 +72,7 @@ class Majority:
     def _votes(self) -> dict[int, tuple[Cubes, Array]]:
         """Cubes that some of the views see, and the share of each that a view takes for the object."""
         votes = {}
-        for frame in spread([*self.views], MAX_VIEWS):
+        for frame in spread([*self.views], SOME_VIEWS):
             seen, cubes = self._cubes(frame)
             own, which = np.unique(cubes, return_inverse=True)
             votes[frame] = own, np.bincount(which, self.found(frame)[seen]) / np.bincount(which)

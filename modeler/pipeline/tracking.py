@@ -8,13 +8,14 @@ from functools import cached_property
 from threading import Lock
 
 from modeler.closure import Closer, Placement
-from modeler.pipeline.attempts import FULL, Attempt, Search, Stage
+from modeler.pipeline.attempts import Attempt, Search, Stage
 from modeler.pipeline.pairs import Registrations
 from modeler.pipeline.state import State, newest_ready
 from modeler.registration.posterior import failed
 from modeler.system.concurrency import parallel_map
 from modeler.system.disk_arrays import release
 from modeler.types import (
+    FULL_EFFORT,
     AbstractPrior,
     Edge,
     InputError,
@@ -80,7 +81,7 @@ class Tracker:
             search.add(attempt, self._registered(attempt))
             effort = attempt.effort
             placement = self.closer.placement(search.candidates, self.state.map_view, steps=search.steps)
-            if placement.base is not None and placement.base.convincing and effort == FULL:
+            if placement.base is not None and placement.base.convincing and effort == FULL_EFFORT:
                 break
         return search.posteriors, placement
 

@@ -38,7 +38,7 @@ class HeldPrior(AbstractPrior):
     """Probability that the hand regrasps the object from one frame to the next."""
     regrasped: AbstractPrior = field(default_factory=lambda: GeneralPrior(limits_assumed=True))
     """Prior of the object's motion in a regrasp; evidence."""
-    steps: float = 1.0
+    steps: float = GeneralPrior.steps
     """Number of steps of a motion."""
     max_offset_m: float | None = None
     """Largest distance between the centroids if the hand is only a proposal (returns to earlier views); it grows with

@@ -26,7 +26,8 @@ from modeler.types import (
 from modeler.types.base import check_parameters
 
 _MIN_SIGMA_RAD, _MIN_SIGMA_M = np.radians(2.0), 0.004  # the search does not need more precision
-_INFLATION = 2.0  # factor on the graph's standard deviations, which do not include systematic errors
+INFLATION = 2.0
+"""Factor on the graph's standard deviations, which may be optimistic, and do not include systematic errors."""
 MAX_STEPS = 3.0  # beyond, constant velocity is no longer plausible
 
 
@@ -89,7 +90,7 @@ class PredictedProposal(AbstractPrior):
         sigma_rad, sigma_m = (
             float(np.sqrt(np.linalg.eigvalsh(c)[-1])) for c in (covariance[:3, :3], covariance[3:, 3:])
         )
-        sigmas = max(_INFLATION * sigma_rad, _MIN_SIGMA_RAD), max(_INFLATION * sigma_m, _MIN_SIGMA_M)
+        sigmas = max(INFLATION * sigma_rad, _MIN_SIGMA_RAD), max(INFLATION * sigma_m, _MIN_SIGMA_M)
         guess = KernelMixture.about(self.expected.mean, source, *sigmas)
         return defensive_mixture(self.known.between(source, target), [guess])
 

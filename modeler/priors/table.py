@@ -142,7 +142,7 @@ class TablePrior(AbstractPrior):
     """Standard deviation of the motion along the normal, on top of the plane's own uncertainty."""
     limits_assumed: bool = False
     """Whether the limits are defaults: if nothing within them matches, any motion on the table is possible."""
-    steps: float = 1.0
+    steps: float = GeneralPrior.steps
     """Number of steps of a motion, at least 1: shifts add up."""
 
     def __post_init__(self) -> None:

@@ -276,7 +276,7 @@ class TurntablePrior(AbstractPrior):
     """Standard deviation of the rotation out of the axis."""
     wobble_m: float = WOBBLE_M
     """Standard deviation of the shift that is not due to the turn about the axis."""
-    steps: float = 1.0
+    steps: float = GeneralPrior.steps
     """Number of steps of a motion, at least 1: shifts add up."""
     needs_table: bool = False
     """Whether views without a table are rejected: the product of table and step."""

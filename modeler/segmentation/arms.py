@@ -18,18 +18,15 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
-from modeler.segmentation.depth_images import DepthNoise, is_cut, planning_stride, point_image
-from modeler.types import Array, BoolArray, Camera, Frame, spread
+from modeler.segmentation.depth_images import HARDLY, MOSTLY, DepthNoise, is_cut, planning_stride, point_image
+from modeler.types import SOME_POINTS, Array, BoolArray, Camera, Frame, spread
 
 _SEED: Final = 0.2  # share of a mask, next to the edge of the image, that is taken for the arm at first; by hand
 _TURN_RAD: Final = 0.15  # sd of an arm's turn between two frames; by hand: objects turn by more in all
 _SHIFT: Final = 0.5  # likewise of its shift, as a share of the mask's size
-_AGREES: Final = 0.7  # share of the frames that see it from which surface moves with the arm; 0.5: stops lose objects
-_STEADY: Final = 0.75  # of the surface next to the edge that has to agree: that of an object which turns does not
 _FRAMES: Final = 8  # with which one is compared: of 15, for half of the time
-_POINTS: Final = 400  # that are aligned, likewise for time
-_EFFECTIVE: Final = 200.0  # of them, neighbours being alike: against the priors of turn and shift
-_GROWTHS, _SETTLED = 5, 0.99  # at most, and the share of a mask from which nothing grows any more; by hand
+_EFFECTIVE: Final = 200.0  # of the aligned points, neighbours being alike: against the priors of turn and shift
+_GROWTHS: Final = 5  # at most; by hand
 _COARSEST, _FINER = 8.0, 0.7  # tolerances at first, and their ratio from step to step; by hand
 _STEPS: Final = 12  # six until the tolerance is the noise's, by this ratio, and as many at it
 
@@ -123,7 +120,7 @@ class Arms:
         motions = [[np.eye(4), se3.translation(one.middle_m - middle_m)] for one in others]
         for growth in range(_GROWTHS):
             some_m = view.points_m[arm]
-            some_m = some_m[:: max(len(some_m) // _POINTS, 1)]
+            some_m = some_m[:: max(len(some_m) // SOME_POINTS, 1)]
             looks = []
             for number, other in enumerate(others):
                 found = [
@@ -134,13 +131,13 @@ class Arms:
                 best = int(np.argmax([np.count_nonzero(there[on_seed]) for there, _ in tried]))
                 motions[number] = [found[best]]
                 there, away = (one[on_seed] for one in tried[best])
-                if np.mean(there) >= _STEADY * np.mean(there | away) > 0.0:
+                if np.mean(there) >= MOSTLY * np.mean(there | away) > 0.0:  # surface that turns does not agree
                     looks.append(tried[best])
             if 2 * len(looks) < len(others):
                 return np.zeros_like(arm)
-            pieces = _labelled((_shares(view.mask, looks) > _AGREES) | end)
+            pieces = _labelled((_shares(view.mask, looks) > MOSTLY) | end)
             before, arm = arm, view.mask & (pieces == pieces[end][0])
-            if np.mean(before[view.mask] == arm[view.mask]) > _SETTLED:
+            if np.mean(before[view.mask] != arm[view.mask]) < HARDLY:
                 break
         return arm
 

@@ -15,10 +15,11 @@ from modeler.significance import SIGMAS
 from modeler.types import Array, BoolArray, Camera, Float32Array
 
 MOST = 0.5  # the majority of pixels, frames or a rim
-MOSTLY = 0.7  # of the measurements at a static pixel agree; of the frames show the object alone
+MOSTLY = 0.7  # of the measurements at a static pixel agree; of the frames show the object alone, or an arm in place
 CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
 LEAST_PIECE = 0.07  # of the largest: noise along edges, and false depth around limbs, have pieces of up to 6 %
 STRAY_WEIGHT = 0.2  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
+LEAST_PIXELS = 100  # of an object, or of a plane: fewer tell little of their shape
 HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an image that shows an object alone
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
 _APART_PX = 4  # of the downsampled image: blocks that stereo matches are as wide

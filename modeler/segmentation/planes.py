@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from modeler.segmentation.depth_images import MOSTLY, DepthNoise
+from modeler.segmentation.depth_images import LEAST_PIXELS, MOSTLY, DepthNoise
 from modeler.significance import SIGMAS
 from modeler.types import Array, BoolArray, Float32Array, Plane
 
@@ -18,7 +18,6 @@ Real = TypeVar("Real", bound=np.floating[Any])
 # cameras, differ by 3, 4 and 13 mrad.
 _SYSTEMATIC_TILT_RAD = 0.005
 _SYSTEMATIC_SHARE = 0.0015  # error of the plane's distance that its residuals do not show, and of the depth's scale
-_MIN_POINTS = 50  # of a plane, and of the ground seen on it
 _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
 _CELL_PX = 5
 _MAX_HYPOTHESES = 200
@@ -59,7 +58,7 @@ def fit_plane(
     Returns:
         The plane with its normal towards the camera, or None where too few points agree or they lie on a line.
     """
-    if len(points) < _MIN_POINTS:
+    if len(points) < LEAST_PIXELS:
         return None
     sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), len(points))
     found = _trimmed(points, sigma, guess)
@@ -96,7 +95,7 @@ def _trimmed(points: Array, sigma: Array, guess: Array | None) -> tuple[Array, B
     inlier = np.zeros(len(points), dtype=np.bool_)
     for width in widths:
         inlier = np.abs(heights(points, plane)) < SIGMAS * width * sigma
-        if np.count_nonzero(inlier) < _MIN_POINTS:
+        if np.count_nonzero(inlier) < LEAST_PIXELS:
             return None
         plane = least_squares(points[inlier], weight[inlier])
     return plane, inlier
@@ -247,7 +246,7 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
         holds = np.mean(height > -tolerance) > _ABOVE_SHARE and low < size
         holds &= lowest < _TOUCHING_SHARE * size or plane[1] < _UPRIGHT
         merit = (int(grade), -float(np.median(height)))
-        if seen >= _MIN_POINTS and holds and merit > best:
+        if seen >= LEAST_PIXELS and holds and merit > best:
             best, found = merit, plane
     return found
 

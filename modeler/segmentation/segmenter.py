@@ -11,6 +11,7 @@ from scipy import ndimage
 from modeler.segmentation.arms import Arms
 from modeler.segmentation.background_colour import BackgroundColour, without_background
 from modeler.segmentation.depth_images import (
+    LEAST_PIXELS,
     MOST,
     DepthNoise,
     at_rim,
@@ -54,7 +55,7 @@ class Segmenter:
     """Region in which the object is: x0 y0 x1 y1 in px, x1 and y1 outside it; None = the whole image."""
     max_depth_m: float | None = None
     """Largest depth of the object in m; None = no limit."""
-    min_points: int = 100
+    min_points: int = LEAST_PIXELS
     """Number of pixels below which an object is too small to register."""
     gap: float = 0.016
     """Largest gap between parts of one object, as a share of its distance: a dozen pixels of usual cameras."""

@@ -14,7 +14,7 @@ from modeler.closure import Closer, MapView
 from modeler.graph.focal import LIMIT_STEPS
 from modeler.priors import PokePrior, turntable_in
 from modeler.priors.mixtures import Gaussian
-from modeler.registration import VisibilityLikelihood
+from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.points import point_rows
 from modeler.suggestion.candidates import Candidate
 from modeler.suggestion.edge_prediction import TURNS_RAD, USUAL_NOISE, EdgePredictor, PredictedEdge, PredictedView
@@ -359,7 +359,7 @@ class Belief:
         points_m = se3.transform(camera_from_object, self.cells.points_m[visible])
         normals = self.cells.normals[visible] @ camera_from_object[:3, :3].T
         seen = np.flatnonzero(self.cells.seen[visible])
-        if len(seen) < 20:  # as few as a registration takes
+        if len(seen) < VisibilityRegistrar.min_points:
             return None
         share = 1.0 - self.new_share(shown)
         count = int(self.predictor.likelihood.points * share)

@@ -42,7 +42,6 @@ _MODE_TEMPER: Final = 0.3
 Over 175 steps of 35 shapes of the tuning half, the predicted mass of the true mode is 0.76 untempered and 0.61
 tempered; realised 0.63."""
 _CORE_RAD: Final = np.radians(6.0)  # two steps: nearer turns are described by the local Gaussian
-_LARGEST_STEP_RAD: Final = 0.1  # steps do not rotate, because of the damping
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +173,7 @@ class EdgePredictor:
         n of the tempered likelihood (eq. 4.6), and those of the refinement (eq. 6.1) with residuals as predicted.
         """
         tempered = 1.0 / (1.0 / self.likelihood.max_independent + 1.0 / patches)
-        return tempered + visible_share(patches / 2**Refiner.halvings) * patches
+        return tempered + visible_share(patches / Refiner.patches) * patches
 
     def edge(
         self,
@@ -278,7 +277,7 @@ def turned(pair: PairLikelihood, target_from_source: Array, axis_m: Array, up: A
     """
     none = np.zeros((len(TURNS_RAD), 3))
     poses = se3.moved(target_from_source, np.hstack([TURNS_RAD[:, None] * up, none]), axis_m)
-    held = Regulariser(rows(target_from_source), np.zeros((6, 6)), np.repeat([1e9, 1e3], 3), _LARGEST_STEP_RAD)
+    held = Regulariser(rows(target_from_source), np.zeros((6, 6)), np.repeat([1e9, 1e3], 3), Search.basin)
     # Noise of 0.02 to 0.1 of the size, and 2 to 8 steps, give the same masses to 0.03; without steps they differ.
     moved = pair.descend(poses, 0.05 * pair.size_m, held, steps=Search.steps)
     shifts_m = se3.difference(poses, moved, axis_m)[:, 3:]

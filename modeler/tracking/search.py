@@ -14,14 +14,13 @@ from modeler.kernels import point_likelihood
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
 from modeler.registration.visibility.directed import DirectedLikelihood
-from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.likelihood import DESCENT_STRIDE, PairLikelihood
 from modeler.registration.visibility.points import FixedPattern, points_of, spread_points
 from modeler.registration.visibility.search import Search
 from modeler.tracking.rendering import COARSE_PX, MOST_PX, ModelRenderer
 from modeler.types import Array, Camera, RayImage
 from modeler.views import Sensor
 
-_STRIDE = 4  # every fourth point is scored at the start
 _NEAR = 1.15  # ratio of distances from which the model looks about the same
 RIVAL_NATS: Final = 12.0
 """Below the best pose, a pose of the search is negligible: twice the log of a negligible share."""
@@ -163,7 +162,7 @@ class ViewpointSearch:
         starts[..., :3, :3] = Rotation.from_rotvec(angles[:, None] * axis).as_matrix() @ facing
         starts[..., :3, 3] = centroids_m[:, None] - starts[..., :3, :3] @ view.centroid_m
         starts = starts.reshape(-1, 4, 4)
-        scores = pair.tempered(starts, 2.0 * self.search.blurs_m(pair)[0], stride=_STRIDE)
+        scores = pair.tempered(starts, 2.0 * self.search.blurs_m(pair)[0], stride=DESCENT_STRIDE)
         best = starts[np.argsort(-scores, kind="stable")[: self.descended]]
         return self._descended(pair, best, viewpoints.camera_from_model[number])
 

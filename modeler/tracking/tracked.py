@@ -15,8 +15,8 @@ from modeler.types import Array, Mode, PoseGaussian, RayImage
 
 Presence = Literal["found", "followed", "unsure", "not there", "too few points"]
 
-USABLE_RAD, USABLE_M = np.radians(3.0), 0.005
-"""Largest standard deviations, of a rotation and of the object's place, with which a pose is of use."""
+USABLE_M: Final = 0.005
+"""Largest standard deviation of the object's place with which a pose is of use; that of a rotation is `WRONG_RAD`."""
 
 
 DOUBT: Final = 0.02
@@ -44,7 +44,7 @@ class Tracked:
     overlap: float = 0.0
     """Share (0..1) of the surface that frame and model should both show, at the pose, that both do show."""
     usable: bool = False
-    """Whether there is one mode, but for the model's symmetries, with an sd of at most `USABLE_RAD` and `USABLE_M`.
+    """Whether there is one mode, but for the model's symmetries, with an sd of at most `WRONG_RAD` and `USABLE_M`.
 
     Both are given the camera, whose focal length and depth scale move all poses alike."""
     reason: str = ""

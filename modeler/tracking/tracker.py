@@ -28,7 +28,6 @@ from modeler.tracking.search import RIVAL_NATS, Viewpoints, ViewpointSearch, log
 from modeler.tracking.tracked import (
     DOUBT,
     USABLE_M,
-    USABLE_RAD,
     Presence,
     Tracked,
     free_directions,
@@ -56,6 +55,7 @@ from modeler.types import (
     checked,
     pooled,
 )
+from modeler.verdict.evidence import WRONG_RAD
 from modeler.views import Sensor
 from modeler.views.rays import part_of, thinned
 
@@ -64,8 +64,9 @@ UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1  # of a prediction from the frames before
 _OVERLAP = 0.6  # least, with any rotation
-_BEYOND_DOUBT = 30.0  # nats from which no other place is searched: twice what a wrong one reached in 87 scenes
-_HOPELESS = -30.0  # nats from which no place is tried but the likeliest: in 144 scenes the right one had -29 or more
+_BEYOND_DOUBT = 30.0
+"""Nats from which no other place is searched: twice what a wrong one reached in 87 scenes. Of as many against them, no
+place is tried but the likeliest: in 144 scenes the right one had -29 or more."""
 _MOST_DRAWS = 2000  # after which only wrong poses need more: right ones in 26 frames took 600 to 2,000
 _UNIT = 30.0  # ratio of sizes from which on the unit of lengths is wrong: 100 or 1000 times off
 _MOST_AROUND = 6  # distances at which viewpoints are kept, of 20 MB each
@@ -318,7 +319,7 @@ class Tracker:
         rough.sort(key=lambda one: -one[0])
         least = -np.inf
         for evidence, poses, view in rough[:_MOST_TRIED]:
-            hopeless = evidence < _HOPELESS and view is not rough[0][2]
+            hopeless = evidence < -_BEYOND_DOUBT and view is not rough[0][2]
             if (
                 hopeless
                 or evidence < least
@@ -460,7 +461,7 @@ class Tracker:
             if not found.continuous and min(apart) > ALIGNMENT_SIGMA_RAD:
                 return "several poses explain the image"
         sigma_rad, sigma_m = self._sigmas(first, found)
-        if sigma_rad > USABLE_RAD:
+        if sigma_rad > WRONG_RAD:
             return f"its rotation is uncertain by {np.degrees(sigma_rad):.1f}°"
         return f"its place is uncertain by {1000.0 * sigma_m:.1f} mm" if sigma_m > USABLE_M else ""
 

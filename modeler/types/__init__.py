@@ -4,6 +4,8 @@ Lengths are metres and angles radians unless a name says otherwise; `se3` holds 
 All values are frozen.
 """
 
+from modeler.types.base import SOME_POINTS as SOME_POINTS
+from modeler.types.base import SOME_VIEWS as SOME_VIEWS
 from modeler.types.base import Array as Array
 from modeler.types.base import BoolArray as BoolArray
 from modeler.types.base import Float32Array as Float32Array
@@ -11,6 +13,7 @@ from modeler.types.base import InputError as InputError
 from modeler.types.base import Outcome as Outcome
 from modeler.types.base import checked as checked
 from modeler.types.base import spread as spread
+from modeler.types.interfaces import FULL_EFFORT as FULL_EFFORT
 from modeler.types.interfaces import AbstractPairCache as AbstractPairCache
 from modeler.types.interfaces import AbstractPoseDensity as AbstractPoseDensity
 from modeler.types.interfaces import AbstractPrior as AbstractPrior

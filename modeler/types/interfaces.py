@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -152,6 +153,10 @@ class AbstractPrior(ABC):
         return None
 
 
+FULL_EFFORT: Final = 1.0
+"""Effort of a registration that may become an edge."""
+
+
 @dataclass(frozen=True, eq=False)
 class ViewPair:
     """Two views to register, and all else on which the result depends."""
@@ -162,7 +167,7 @@ class ViewPair:
     """Prior density of target_from_source."""
     rng: np.random.Generator
     """Source of all randomness."""
-    effort: float = 1.0
+    effort: float = FULL_EFFORT
     """Share (0..1] of the usual effort, for pairs that may share no surface."""
     near: Array | None = None
     """(4, 4) target_from_source of the only mode that is asked for, if it is known roughly."""
@@ -174,7 +179,7 @@ class AbstractRegistrar(ABC):
     @property
     def least_effort(self) -> float:
         """The least effort at which registering costs less than with more; by default 1: there is one way only."""
-        return 1.0
+        return FULL_EFFORT
 
     @abstractmethod
     def posterior_of(self, pair: ViewPair) -> Posterior:
@@ -187,7 +192,7 @@ class AbstractRegistrar(ABC):
         density: AbstractPoseDensity,
         *,
         rng: np.random.Generator,
-        effort: float = 1.0,
+        effort: float = FULL_EFFORT,
     ) -> Posterior:
         """Return the posterior of target_from_source; for the arguments see `ViewPair`."""
         return self.posterior_of(ViewPair(source, target, density, rng, effort))

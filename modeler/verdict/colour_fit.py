@@ -17,25 +17,27 @@ from scipy import ndimage
 from scipy.special import ndtri
 
 from modeler import se3
-from modeler.closure.consistency import MIN_TURN_DEG
+from modeler.closure.consistency import MIN_TURN_DEG, Thresholds
 from modeler.kernels.photometric import displaced_correlations
+from modeler.priors import GeneralPrior
+from modeler.registration.visibility.photometric import LOGS
 from modeler.significance import RARE
-from modeler.types import FLIPS, Array, BoolArray, Check, Flip, RayImage, spread
-from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS
+from modeler.types import FLIPS, SOME_POINTS, Array, BoolArray, Check, Flip, RayImage, spread
+from modeler.verdict.evidence import MAX_VIEWS
 from modeler.views import Sensor
 
 _PAIRS: Final = 12  # of views that are compared, spread over the run: one has a sd of some 0.1
-NEAR_DEG, FAR_DEG = MIN_TURN_DEG, 50.0  # rotation between views that share surface
+NEAR_DEG, FAR_DEG = MIN_TURN_DEG, GeneralPrior.max_rotation_deg  # rotation between views that share surface
 MIN_SHARED: Final = 60  # points of a pair: the sd of a chance correlation is then 0.13
 _MARGIN: Final = 4.0  # widths of the fine band: nearer to its outline, a feature is of the background
 _WIDTH: Final = 0.01  # of the object's extent in px: width of the fine band, at least a pixel
 _COARSE: Final = 2.0  # ratio of the widths of the two bands, and of the steps of the search to the finer one
 _STRIDE: Final = 4  # every fourth point is used for the search: 12 pairs have a thousand
-_LOGS: Final = np.log(np.arange(256) + 4.0).astype(np.float32) / 3.0  # of 8-bit values, as in registration
 _REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: baselines of 15 to 50 mm at half a metre
 _LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
-AT_LEAST: Final = 0.5  # of the correlation elsewhere, and of that one: less is found by chance on few points
+AT_LEAST: Final = Thresholds.min_correlation
+"""Of the correlation elsewhere, and of that one: less is found by chance on few points."""
 _INNER: Final[WeakKeyDictionary[RayImage, BoolArray]] = WeakKeyDictionary()  # as a view is part of several pairs
 _FEATURES: Final[WeakKeyDictionary[RayImage, tuple[float, np.ndarray]]] = WeakKeyDictionary()  # with the band's width
 
@@ -138,7 +140,7 @@ class Pair:
         """Return the surface of the second view that the first one sees, too."""
         target, source = views[first], views[second]
         kept = np.flatnonzero(_inside(source, source.pixels))
-        kept = kept[:: max(len(kept) // MAX_POINTS, 1)]
+        kept = kept[:: max(len(kept) // SOME_POINTS, 1)]
         target_from_source = se3.inverse(trajectory[first]) @ trajectory[second]
         points_m, normals = se3.transform(target_from_source, source.points_m[kept]), source.normals[kept]
         facing = -np.sum(points_m * (normals @ target_from_source[:3, :3].T), axis=1)
@@ -230,7 +232,7 @@ class Comparison:
         known = _FEATURES.get(view)
         if known is None or known[0] != width_px:
             assert view.frame.colour is not None
-            logs = _LOGS[view.frame.colour].sum(axis=-1)
+            logs = LOGS[view.frame.colour].sum(axis=-1)
             near, wide = (ndimage.gaussian_filter(logs, ratio * width_px) for ratio in (1.0, 2.0))
             _FEATURES[view] = known = width_px, np.asarray(near - wide)
         return known[1]

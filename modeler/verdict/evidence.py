@@ -13,6 +13,7 @@ from scipy.special import chdtri
 from modeler import se3
 from modeler.significance import RARE, SELDOM, SIGMAS, radius
 from modeler.types import (
+    SOME_POINTS,
     AbstractPoseDensity,
     AbstractPrior,
     Array,
@@ -49,7 +50,6 @@ MAX_OTHER_MODE: Final = WRONG_SHARE
 
 _DRAWS: Final = 1000  # of a prior: the best of them lies 0.2 nats below the mode of a Gaussian in six dimensions
 MAX_VIEWS: Final = 40  # compared with each other, spread over the run: 1,600 pairs take a second
-MAX_POINTS: Final = 400  # of each: standard deviation of a share of 0.1 is then 0.015
 _MIN_POINTS: Final = 200  # per frame observed by others: standard deviation of its share is then 0.02
 _MIN_JUDGED: Final = 100  # points of a frame observed by two others or more: a share of 0.02 is two of them
 _MARGIN_PX: Final = 2  # pixels at depth edges mix foreground and background
@@ -65,7 +65,7 @@ def displacement(views: Mapping[int, RayImage], solution: Solution) -> Check | N
     if len(frames) < 2 or not len(views[frames[0]].points_m):
         return None
     first = views[frames[0]]
-    points_m = first.points_m[:: max(len(first.points_m) // MAX_POINTS, 1)]
+    points_m = first.points_m[:: max(len(first.points_m) // SOME_POINTS, 1)]
     moved_m = [
         float(
             np.sqrt(np.mean(np.sum((se3.transform(solution.relative(frame, frames[0]), points_m) - points_m) ** 2, 1)))
@@ -386,7 +386,7 @@ def _facing(view: RayImage) -> tuple[Array, Array, np.ndarray]:
     """Return surface points (n, 3) of a view that face its camera, away from its outline, normals (n, 3) and pixels."""
     mask = np.isfinite(view.frame.depth_m) if view.frame.mask is None else view.frame.mask
     inner = ndimage.minimum_filter(mask, size=2 * _MARGIN_PX + 1, mode="nearest")[view.pixels[:, 0], view.pixels[:, 1]]
-    some = np.flatnonzero(inner)[:: max(np.count_nonzero(inner) // MAX_POINTS, 1)]
+    some = np.flatnonzero(inner)[:: max(np.count_nonzero(inner) // SOME_POINTS, 1)]
     some = some[faces_camera(view.points_m[some], view.normals[some])]
     return view.points_m[some], view.normals[some], view.pixels[some]
 

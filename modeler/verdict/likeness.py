@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from modeler import se3
 from modeler.priors.general import LARGE_DEG
 from modeler.significance import RARE, nats_from_mode
-from modeler.types import AbstractPrior, Array, Check, InputError, RayImage, components, spread
+from modeler.types import SOME_POINTS, AbstractPrior, Array, Check, InputError, RayImage, components, spread
 from modeler.verdict.colour_fit import (
     AT_LEAST,
     FAR_DEG,
@@ -32,7 +32,7 @@ from modeler.verdict.colour_fit import (
     has_colour,
     places_in,
 )
-from modeler.verdict.evidence import MAX_POINTS, MAX_VIEWS, TOLERANCE, pixels_of
+from modeler.verdict.evidence import MAX_VIEWS, TOLERANCE, pixels_of
 
 _CLEAR_DEG: Final = 30.0  # largest rotation at which print of right poses agrees: twelve captures have more than half
 _FAINT: Final = 0.015**2  # variance of a logarithm: a plain body before a strong pattern shows 0.010² of it
@@ -92,7 +92,7 @@ def likenesses(
     frames = spread(frames, MAX_VIEWS)
     coloured = {frame: views[frame] for frame in frames if colour and has_colour(views[frame])}
     compared = Comparison(coloured, trajectory, ()) if coloured else None
-    some = {frame: views[frame].along_curve[:: max(len(views[frame].points_m) // MAX_POINTS, 1)] for frame in frames}
+    some = {frame: views[frame].along_curve[:: max(len(views[frame].points_m) // SOME_POINTS, 1)] for frame in frames}
     found = []
     for first, second in combinations(frames, 2):
         motion, joined = se3.inverse(trajectory[first]) @ trajectory[second], (first, second) in edges

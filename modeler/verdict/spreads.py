@@ -11,10 +11,9 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from modeler import se3
-from modeler.types import Array, Check, Edge, FocalLength, RayImage, Solution, spread
-from modeler.verdict.evidence import MAX_POINTS, MAX_VIOLATIONS, WRONG_RAD, WRONG_SHARE, graph_check
+from modeler.types import SOME_POINTS, SOME_VIEWS, Array, Check, Edge, FocalLength, RayImage, Solution, spread
+from modeler.verdict.evidence import MAX_VIOLATIONS, WRONG_RAD, WRONG_SHARE, graph_check
 
-_MOST: Final = 16  # frames whose mean error is none of the model's: 240 motions take a tenth of a second
 _NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then accurate to 0.1 %
 
 
@@ -59,7 +58,7 @@ class AboutMean:
         frames = sorted(solution.covariances)
         if not solution.knows_motions or len(frames) < 2:
             return cls({k: _given_focal_length(solution, k, None) for k in frames}, dict.fromkeys(frames[:1], 1.0))
-        some = spread(frames, _MOST)
+        some = spread(frames, SOME_VIEWS)
         to_object = {frame: se3.adjoint(solution.trajectory[frame]) for frame in frames}
         apart = {
             (frame, other): to_object[frame] @ _given_focal_length(solution, frame, other) @ to_object[frame].T
@@ -168,7 +167,7 @@ def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solutio
         return {}
     places, shifts = [], []
     for frame in frames:
-        points_m = views[frame].points_m[:: max(len(views[frame].points_m) // MAX_POINTS, 1)]
+        points_m = views[frame].points_m[:: max(len(views[frame].points_m) // SOME_POINTS, 1)]
         place_m = se3.transform(solution.trajectory[frame], points_m)
         stretch_m = -(points_m * [1.0, 1.0, 0.0]) @ solution.trajectory[frame][:3, :3].T
         by_focal = focal.by_focal[frame]
@@ -251,7 +250,7 @@ def size_check(
         tolerance_m: error of the surface above which a model is wrong.
     """
     surfaces_m = [
-        se3.transform(trajectory[frame], view.points_m[:: max(len(view.points_m) // MAX_POINTS, 1)])
+        se3.transform(trajectory[frame], view.points_m[:: max(len(view.points_m) // SOME_POINTS, 1)])
         for frame, view in views.items()
         if frame in trajectory
     ]

@@ -156,7 +156,7 @@ def _scalings(factor: float) -> Mapping[str, tuple[VisibilityRegistrar, Patch]]:
         "surface noise (0.1)": _scaled(factor, "likelihood.surface_noise"),
         "surface detail (0.003)": _scaled(factor, "likelihood.surface_detail"),
         "sampler's sizes (200, 300)": _scaled(factor, "sampler.draws", "sampler.samples"),
-        "patches of the refinement (2⁵)": _with(refiner__halvings=4 if factor < 1.0 else 6),
+        "patches of the refinement (32)": _scaled(factor, "refiner.patches"),
         "points (600)": _scaled(factor, "likelihood.points"),
         "samples for each start (15)": _scaled(factor, "search.proposals"),
         "size of a basin (0.2)": _scaled(factor, "search.basin"),

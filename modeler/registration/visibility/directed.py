@@ -13,13 +13,15 @@ from modeler.kernels.point_likelihood import LikelihoodParameters, Projection
 from modeler.registration.visibility.points import OWN_RIM, FixedPattern
 from modeler.significance import SIGMAS
 from modeler.types import Array, RayImage
+from modeler.views import Sensor
 
 if TYPE_CHECKING:
     from modeler.registration.visibility.likelihood import VisibilityLikelihood
 
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' lateral noise, which is independent
-_RELIABLE_COSINE, _COSINE_RAMP = 0.35, 0.25  # from which on ranges are reliable; width of the ramps of f and g
-_COSINES = (_RELIABLE_COSINE + _COSINE_RAMP * np.array([-1.0, 0.0, 0.0, 1.0])).astype(np.float32)  # see `Projection`
+_RAMP = 0.25  # width of the ramps of f and g below and above the cosine from which on ranges are reliable
+_RELIABLE = Sensor.min_cosine
+_COSINES = np.array([_RELIABLE - _RAMP, _RELIABLE, _RELIABLE, _RELIABLE + _RAMP], dtype=np.float32)  # see `Projection`
 # Share of unmeasured pixels near the object above which a camera measures steep surface instead of filling holes, which
 # replaces surface at cosines below 0.35 by what is behind it: measured up to 46 % of it in captures without one,
 # 18 % with two or three in 1,000, 7 % with five, 2 % with more. With 0.005, models by time of flight were wrong.

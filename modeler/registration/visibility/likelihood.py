@@ -30,8 +30,10 @@ from modeler.significance import UNLIKELY
 from modeler.types import Array, RayImage
 
 _ROUNDING_M = 1e-6  # of depths in single precision: planes without noise may match exactly
-_MIN_MATCHES = 20  # fewer do not determine the nuisance parameters
-_DESCENT_STRIDE = 4  # every fourth point is used for descent
+MIN_MATCHES = 20
+"""Fewer matches, or points, do not determine the nuisance parameters."""
+DESCENT_STRIDE = 4
+"""Every fourth point is used for descent."""
 
 
 class Scores(NamedTuple):
@@ -265,7 +267,7 @@ class PairLikelihood:
                 self.backward.misfits(rows(se3.inverse(pose)), blur_m),
             ]
         )
-        if len(misfits) <= _MIN_MATCHES:
+        if len(misfits) <= MIN_MATCHES:
             return MISFIT
         hidden = self.forward.model.hidden_share
         low, high = 0.0, 2.0
@@ -284,7 +286,7 @@ class PairLikelihood:
         """
         sums = self.forward.residual_excess(rows(pose), blur_m)
         sums += self.backward.residual_excess(rows(se3.inverse(pose)), blur_m)
-        if sums[0, 0] <= _MIN_MATCHES:
+        if sums[0, 0] <= MIN_MATCHES:
             return blur_m, self.forward.rim_m
         surface_m2, rim_m2 = significant_variances(sums, 2.0 * self.patches)
         return max(math.sqrt(surface_m2), _ROUNDING_M), math.sqrt(rim_m2)
@@ -420,10 +422,10 @@ class PairLikelihood:
 
     def descend(self, poses: Array, blur_m: float, regulariser: Regulariser, *, steps: int) -> Array:
         """Return poses (n, 4, 4) after Gauss-Newton steps on matching surface (method, eq. 5.2)."""
-        regulariser = _per_point(regulariser, _DESCENT_STRIDE)
+        regulariser = _per_point(regulariser, DESCENT_STRIDE)
         band = 0 if self.colour is None else self.colour.band(blur_m)
-        colours, weight = self._colours(band, _DESCENT_STRIDE), np.float32(weight_of(ASSUMED_RHO))
-        surfaces = self.surfaces(_DESCENT_STRIDE)
+        colours, weight = self._colours(band, DESCENT_STRIDE), np.float32(weight_of(ASSUMED_RHO))
+        surfaces = self.surfaces(DESCENT_STRIDE)
         moved = gauss_newton.descend(rows(poses), surfaces, colours, weight, self.centre_m, blur_m, regulariser, steps)
         return matrices(moved)
 

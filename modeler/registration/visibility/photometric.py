@@ -24,11 +24,11 @@ FINEST_PX = 0.6
 BANDS = 6
 """Number of bands, each twice as wide as the previous one."""
 
-VALUE, BY_COLUMN, BY_ROW = 0, 1, 2
+VALUE, BY_COLUMN, BY_ROW = range(3)
 """Of a band at a surface point: the feature, and its derivatives by column and row in 1/px."""
 
-_BLACK = 4.0  # added to 8-bit values: below it, noise and rounding would dominate their logarithm
-_LOGS = (np.log(np.arange(256) + _BLACK) / 3.0).astype(np.float32)  # a third for each of three 8-bit channels
+LOGS = (np.log(np.arange(256) + 4.0) / 3.0).astype(np.float32)
+"""Third of the logarithm (256,) of each 8-bit value, for three channels; below 4, noise and rounding would dominate."""
 _COARSEST_ALIGNMENT = 2  # band in which images are first aligned: a tin's print moves by more than its width
 _SHADING_POINTS = 2000  # of a view, to estimate its shading
 _NORMAL_QUARTILE = 0.6745  # median magnitude of a standard normal variable
@@ -325,7 +325,7 @@ def features(frame: Frame, pixels: np.ndarray, normals: np.ndarray) -> np.ndarra
         (3, *(-(-(high + 1 - low) // multiple) * multiple)), dtype=np.float32
     )  # colours, shading, where surface is
     places, logs = np.empty((len(pixels), 2), dtype=np.int32), np.empty(len(pixels), dtype=np.float32)
-    bands.look_up(frame.colour, pixels, low, _LOGS, places, logs)
+    bands.look_up(frame.colour, pixels, low, LOGS, places, logs)
     bands.lay_out(places, logs - logs.mean(), _shading(logs, normals), images)
     halvings, inner = 0, _blurred(images, FINEST_PX)
     for band in range(BANDS):

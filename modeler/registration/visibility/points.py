@@ -100,7 +100,7 @@ class FixedPattern:
 
     share: float = 0.0
     """Fraction χ of the variance that is common to both at the same pixel."""
-    area_px: float = 1.0
+    area_px: float = RayImage.error_area_px
     """Integral of the errors' autocorrelation over the image in px², smoothing included."""
 
     @classmethod

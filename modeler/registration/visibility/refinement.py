@@ -32,8 +32,8 @@ _STEP_SIGMAS = 0.1  # of the samples, at which iterations end; a last step follo
 class Refiner:
     """Moves the samples of a tempered posterior by the information of matching surface."""
 
-    halvings: int = 5
-    """Number of bisections of the surface: 2⁵ patches, whose errors are assumed independent."""
+    patches: int = 32
+    """Number of parts into which the surface is bisected, whose errors are assumed independent: a power of two."""
     min_matches: float = 6.0
     """Least mean number of matches in a patch; with fewer in all, there are fewer patches."""
 
@@ -89,7 +89,7 @@ class Refiner:
     ) -> tuple[Array, Array]:
         """Return a basis (6, 6) of ξ about the centre, and the information (6, 6) in it (method, eq. 6.1)."""
         surface, colours = equations
-        halvings = min(self.halvings, int(np.log2(max(len(surface.residuals) / self.min_matches, 1.0))))
+        halvings = int(np.log2(min(max(len(surface.residuals) / self.min_matches, 1.0), self.patches)))
         if 2**halvings <= len(spread):  # the scatter of six equations would be singular
             return spread, np.zeros((6, 6))
         patches = point_to_plane.bisected(surface.arms, halvings)  # of colours, too: they are those of the same matches

@@ -10,7 +10,7 @@ import numpy as np
 
 from modeler import se3
 from modeler.registration.posterior import MIN_MODE_SHARE, failed, of_multipath, share_at_limit, weighted_gaussian
-from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
+from modeler.registration.visibility.likelihood import MIN_MATCHES, PairLikelihood, VisibilityLikelihood
 from modeler.registration.visibility.refinement import Refiner, first_order
 from modeler.registration.visibility.ridge import without_chance
 from modeler.registration.visibility.sampling import (
@@ -22,6 +22,7 @@ from modeler.registration.visibility.sampling import (
 )
 from modeler.registration.visibility.search import Candidates, Search
 from modeler.types import (
+    FULL_EFFORT,
     AbstractPoseDensity,
     AbstractRegistrar,
     Array,
@@ -65,8 +66,8 @@ class VisibilityRegistrar(AbstractRegistrar):
     refiner: Refiner = field(default_factory=Refiner)
     max_modes: int = 4
     """Largest number of modes that are sampled."""
-    min_points: int = 20
-    """Views with fewer surface points are not registered: they do not determine the noise of matching surface."""
+    min_points: int = MIN_MATCHES
+    """Views with fewer surface points are not registered."""
     min_overlap: float = 0.4
     """Least fraction of matches in the surface that both views should see, as of further edges (`Thresholds`). With
     less than a half, the verdict wants another edge to confirm the registration."""
@@ -86,7 +87,7 @@ class VisibilityRegistrar(AbstractRegistrar):
         With less than full effort, only the best mode is sampled: pairs that share no surface are the most expensive,
         as every mode that the search finds is sampled.
         """
-        method = self if pair.effort == 1.0 else self.scaled(pair.effort)
+        method = self if pair.effort == FULL_EFFORT else self.scaled(pair.effort)
         return method._registered(pair)
 
     def scaled(self, effort: float) -> VisibilityRegistrar:

@@ -9,11 +9,11 @@ import numpy as np
 from modeler import se3
 from modeler.kernels import scores
 from modeler.registration.visibility.likelihood import PairLikelihood
+from modeler.registration.visibility.refinement import Refiner
 from modeler.registration.visibility.sampling import LogLikelihood
 from modeler.se3 import rows
 from modeler.types import Array
 
-_BLOCKS = 32  # of neighbouring points, as many as patches in refinement; every other one belongs to the same half
 _MIN_POSES = 5  # a correlation of fewer says little
 _WIDTH = 0.5  # sd of the smoothing kernel in basins: candidates on a ridge are about as far apart
 
@@ -75,7 +75,7 @@ def without_chance(
 def by_halves(pair: PairLikelihood, poses: Array, blur_m: float, *, typical_misfit: float) -> Array:
     """Return log-likelihoods L (2, 2, n) of surface: of the points of either view, of either half of them.
 
-    Halves alternate in blocks, which share little noise. Not tempered.
+    Halves alternate in as many blocks as refinement has patches, which share little noise. Not tempered.
 
     Args:
         pair: the two views.
@@ -89,7 +89,7 @@ def by_halves(pair: PairLikelihood, poses: Array, blur_m: float, *, typical_misf
     for side, half in np.ndindex(2, 2):
         chosen = [np.arange(0)] * 2  # of the other view, no point
         count = whole[side].points.shape[1]
-        chosen[side] = np.flatnonzero(np.arange(count) * _BLOCKS // count % 2 == half)
+        chosen[side] = np.flatnonzero(np.arange(count) * Refiner.patches // count % 2 == half)
         parts = [
             view._replace(points=np.ascontiguousarray(view.points[:, some]))
             for view, some in zip(whole, chosen, strict=True)

@@ -20,6 +20,8 @@ from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 _STRIDE = 2  # every second point is used for scores
 _COARSE_STRIDE = 8  # where the best pose need only be roughly right
 _OPEN = 0.5  # sd in basins from which on prior and surface leave a motion open: descents reach no farther
+SEPARATE_RAD = 0.25
+"""Rotation between different modes: wider than a basin of attraction (`Search.basin`), in which descents end at one."""
 OPEN_ROTATION_RAD = 1.0
 """Standard deviation of an open rotation: it is 1.33 if all are equally likely, 1.0 within limits of 130°."""
 
