@@ -7,6 +7,8 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
+OUTSIDE: Final = 0.05
+"""Probability of an error that may remain of a pose: the complement of 95 % regions."""
 UNLIKELY: Final = 0.01
 """Probability of chance below which a test of a single thing takes it for none: by convention."""
 SELDOM: Final = 1e-3

@@ -13,7 +13,7 @@ from modeler.evaluation import about_point, nees
 from modeler.kernels import point_to_plane
 from modeler.priors import GeneralPrior
 from modeler.registration import VisibilityRegistrar
-from modeler.registration.visibility.points import FixedPattern
+from modeler.registration.visibility.directed import FixedPattern
 from modeler.types import Posterior, RayImage, SensorNoise
 from modeler.views import Sensor
 

@@ -13,7 +13,6 @@ from ring_graphs import edge, turntable
 from modeler import se3
 from modeler.closure.map_view import composed
 from modeler.evaluation import nees, rotation_error_deg, true_motion
-from modeler.fusion import widened
 from modeler.graph import MovingGraph, PoseGraph, estimate_focal_length, solve
 from modeler.graph.focal import RELIEF_ERROR
 from modeler.pipeline import Modeler
@@ -36,6 +35,7 @@ from modeler.types import (
     Solution,
     Step,
 )
+from modeler.verdict.spreads import widened
 from modeler.views import Sensor
 
 

@@ -7,7 +7,7 @@ import pytest
 from segmentation_worlds import CAMERA, OBJECT, World, iou
 
 import modeler
-from modeler.pipeline.still_scene import Majority
+from modeler.pipeline.correcting import Majority
 from modeler.runs.joining import edit
 from modeler.runs.reopening import reopened
 from modeler.segmentation import Segmenter

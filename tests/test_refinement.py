@@ -13,8 +13,8 @@ from modeler.evaluation import rotation_error_deg
 from modeler.kernels import point_to_plane
 from modeler.registration.posterior import weighted_gaussian
 from modeler.registration.visibility import VisibilityLikelihood
+from modeler.registration.visibility.directed import FixedPattern
 from modeler.registration.visibility.likelihood import MatchNoise
-from modeler.registration.visibility.points import FixedPattern
 from modeler.registration.visibility.refinement import Refiner, shrunk, visible_share
 from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows

@@ -14,8 +14,8 @@ from modeler.kernels import planes
 from modeler.kernels.point_to_plane import FACING_WEIGHT, OTHER_RIM, WEIGHT
 from modeler.priors import GeneralPrior
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
+from modeler.registration.visibility.directed import OWN_RIM, nonnegative_solution, significant_variances
 from modeler.registration.visibility.likelihood import PairLikelihood
-from modeler.registration.visibility.points import OWN_RIM, nonnegative_solution, significant_variances
 from modeler.registration.visibility.refinement import Equations
 from modeler.se3 import rows
 from modeler.sequences import bundled, open_sequence

@@ -7,9 +7,10 @@ import trimesh
 from tabletop import BALL, POSES
 
 from modeler import se3
-from modeler.fusion import Fuser, widened
+from modeler.fusion import Fuser
 from modeler.fusion.meshing import flattened_m, normals_of
 from modeler.types import ObjectModel, Solution
+from modeler.verdict.spreads import widened
 
 
 def test_smoothing_moves_a_ball_by_its_curvature() -> None:

@@ -12,6 +12,7 @@ from modeler.closure.consistency import ConsistencyModel, Thresholds, Usual, mod
 from modeler.closure.information_gain import InformationGain
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.priors.general import LARGE_DEG
+from modeler.significance import UNLIKELY
 from modeler.types import (
     AWAY_DEG,
     NEAR_DEG,
@@ -31,7 +32,6 @@ from modeler.types import (
     segments,
 )
 
-_MIN_PROBABILITY = 0.02  # of a view to be within reach: returns after uncertain turns add much information
 _SPAN_POWER = 6.0  # an edge over 25° adds half the information of one over none, over 50° a fourteenth
 
 
@@ -45,7 +45,8 @@ class Closer:
     """
 
     max_angle_deg: float = NEAR_DEG
-    """Largest predicted rotation in degrees to an earlier view."""
+    """Largest predicted rotation in degrees to an earlier view: views are registered unless they are unlikely to be
+    within it, as returns after uncertain turns add much information."""
     away_deg: float = AWAY_DEG
     """Rotation in degrees by which the object must have turned away from an earlier view for an edge to it to be a
     closure."""
@@ -61,8 +62,6 @@ class Closer:
     """Largest number of further views to register each frame against once all are in; 0 = none."""
     max_span_deg: float = 55.0
     """Largest rotation in degrees to such a view: two steps of the usual 25°."""
-    min_span_gain_nats: float = 0.1
-    """Least expected information gain of such an edge: that of one over two steps of 25°."""
     max_relocations: int = 4
     """Largest number of earlier views to register a frame against that the previous view does not place."""
     thresholds: Thresholds = field(default_factory=Thresholds)
@@ -85,7 +84,7 @@ class Closer:
         angle_deg = np.degrees(se3.rotation_angle(se3.inverse(map_view.poses(frames)) @ expected))
         systematic = self.consistency.systematic(1, map_view.views[base.target].centroid_m)
         gain = InformationGain(map_view, base.target, expected, systematic, self.max_angle_deg)
-        in_reach = gain.probability_within(frames, angle_deg) >= _MIN_PROBABILITY
+        in_reach = gain.probability_within(frames, angle_deg) >= UNLIKELY
         near = [int(k) for k in np.flatnonzero(in_reach) if frames[k] != base.target]
         chosen, spanned = [], False
         for candidate in gain.candidates([frames[k] for k in near], angle_deg[near], self.min_gain_nats):
@@ -107,7 +106,7 @@ class Closer:
         # A turn of few large steps ends one step before its start.
         reach_deg = self.max_angle_deg if closed else max(self.max_angle_deg, LARGE_DEG)
         probability = replace(gain, max_angle_deg=reach_deg).probability_within([first], np.array([angle_deg]))
-        within = bool(probability[0] >= _MIN_PROBABILITY)
+        within = bool(probability[0] >= UNLIKELY)
         return within and known.came_back(first, last, gain.paths, away_deg=self.away_deg)
 
     def span_pairs(self, map_view: MapView) -> tuple[tuple[int, int], ...]:
@@ -139,7 +138,7 @@ class Closer:
                 map_view, source, pose, systematic, self.max_span_deg, has_own_edge=False, power=_SPAN_POWER
             )
             near = [k for k in np.flatnonzero(angle_deg <= self.max_span_deg) if {source, earlier[k]} not in tried]
-            found = gain.candidates([earlier[k] for k in near], angle_deg[near], self.min_span_gain_nats)
+            found = gain.candidates([earlier[k] for k in near], angle_deg[near])
             chosen = [one.frame for one in found if one.overlap >= self.thresholds.min_overlap]
             chosen = [frame for frame in earlier[-1:] if {source, frame} in failed] + chosen
             untried = source in ends and len(earlier) > 0 and {source, earlier[0]} not in tried

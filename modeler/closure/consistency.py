@@ -13,7 +13,7 @@ from modeler.closure.information_gain import RECENT_EDGES
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.priors.proposals import INFLATION
 from modeler.registration import VisibilityRegistrar
-from modeler.significance import SELDOM, radius
+from modeler.significance import OUTSIDE, QUORUM, SELDOM, radius
 from modeler.types import (
     Array,
     Consistency,
@@ -34,7 +34,6 @@ from modeler.types import (
 MIN_TURN_DEG = 6.0
 """Least rotation between views whose print is compared: what hardly moves is taken for light."""
 _CORRELATION_SPREAD = 0.2  # sd of that of right edges as a share of the median: measured on captures
-_MIN_CORRELATIONS = 2  # one may be of views that hardly differ
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,6 @@ class Thresholds:
     up to 29 nats below it, wrong ones from 3 above to 32 below: what is refused matches next to nothing."""
     max_likelihood_drop_sigmas: float = 8.0
     """The same in robust standard deviations of the run's edges; the larger of both is used."""
-    min_edges: int = 5
-    """Least number of edges for a median."""
     min_correlation: float = 0.5
     """Least correlation of colours in the run's edges from which it counts."""
     max_other_print_nats: float = 2.3
@@ -75,8 +72,8 @@ class Thresholds:
         nats = np.array([posterior.log_marginal_likelihood for posterior in recent])
         correlations = np.array([posterior.colour_correlation for posterior in recent])
         nats, correlations = nats[np.isfinite(nats)], correlations[np.isfinite(correlations)]
-        correlation = float(np.median(correlations)) if len(correlations) >= _MIN_CORRELATIONS else float("nan")
-        if len(nats) < self.min_edges:
+        correlation = float(np.median(correlations)) if len(correlations) >= QUORUM else float("nan")
+        if len(nats) < QUORUM:
             return Usual(correlation=correlation)
         median = float(np.median(nats))
         scatter = 1.4826 * float(np.median(np.abs(nats - median)))
@@ -180,7 +177,7 @@ class ConsistencyModel:
     """Systematic translation error of an edge as a share of the object's distance; it accumulates along a chain."""
     max_distance: float = radius(SELDOM)
     """Largest Mahalanobis distance: √χ²₆(0.999), which 1 of 1000 true closures exceeds."""
-    min_weight: float = 0.05
+    min_weight: float = OUTSIDE
     """Least fraction (0..1) of the posterior's mass in consistent modes."""
 
     def systematic(self, length: int, centroid_m: Array) -> Array:

@@ -69,7 +69,7 @@ class InformationGain:
         sigma_deg = np.maximum(np.degrees(np.sqrt(variance_rad2 + own_rad2)), 1e-6)
         return np.where(np.isinf(variance_rad2), 0.0, ndtr((self.max_angle_deg - angle_deg) / sigma_deg))
 
-    def candidates(self, frames: Sequence[int], angle_deg: Array, min_gain_nats: float) -> list[Candidate]:
+    def candidates(self, frames: Sequence[int], angle_deg: Array, min_gain_nats: float = 0.0) -> list[Candidate]:
         """Return the most informative of some earlier views, largest gain first.
 
         The shortest path bounds the covariance of the motion, so that the covariance itself is computed for only a few

@@ -1,7 +1,6 @@
 """Fusion of posed depth views into one model of the object: point cloud and mesh."""
 
 from modeler.fusion.alignment import Match, Matcher
-from modeler.fusion.deformation import widened
 from modeler.fusion.depth_views import conditional_covariances
 from modeler.fusion.fuser import Fuser, FusionVolume
 from modeler.fusion.symmetries import Symmetries, SymmetryFinder
@@ -14,5 +13,4 @@ __all__ = [
     "Symmetries",
     "SymmetryFinder",
     "conditional_covariances",
-    "widened",
 ]

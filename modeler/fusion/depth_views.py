@@ -22,7 +22,7 @@ STEEPEST_RAD = 1.40  # steeper steps between neighbouring pixels (80°) are dept
 # Measured: over six captures the colours of held-out views are predicted best with 6 to 16.
 BLEEDING_PX = 10.0
 SAMPLES = 20000  # points at which views are compared
-BATCH = 1 << 18  # points or lookups per kernel call, which bounds memory
+BATCH = 1 << 18  # points, or lookups of them in views, at a time, which bounds memory
 BLOCK_BYTES = 64 * 2**20  # of a block of views, which bounds memory
 BLOCK_VIEWS = 50  # least number in one of several blocks: views vote against outliers of others in their block
 PIXEL_BYTES, POINT_BYTES = 15, 72  # of a pixel and a surface point in `DepthViews`

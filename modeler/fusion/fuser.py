@@ -279,7 +279,7 @@ class FusionVolume:
         if watertight:
             return self._closed_mesh(field, vertices, used, weak, sigmas_m)
         means = meshing.neighbour_means(compact, len(used))
-        smooth = meshing.laplacian_smoothed(vertices[used], means, np.isinf(sigmas_m[used]), meshing.SPANNING_PASSES)
+        smooth = meshing.laplacian_smoothed(vertices[used], means, np.isinf(sigmas_m[used]), meshing.PASSES)
         smooth = meshing.taubin_smoothed(smooth, means, self.fuser.fairing)
         smooth = meshing.taubin_smoothed(smooth, means, meshing.WEAK_PASSES, weak[used])
         return meshing.without_relief(smooth, compact, sigmas_m[used]), compact, np.ones(len(used), dtype=bool)

@@ -17,7 +17,7 @@ from modeler.types import Array, BoolArray, area_vectors_m2, areas_m2
 
 LEAST_NEIGHBOURS = 15  # of the 26 around a voxel that fill it: more than half, so that open borders do not grow
 COARSE_VOXELS = 64**3  # of models whose shape need only be about right
-FAINT = 1e-3  # weight of a voxel that is filled: known, but next to nothing against an observation
+FAINT = 1e-3  # weight, of a voxel that is filled say: next to nothing against an observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +141,11 @@ NORMAL_NEIGHBOURS = 12  # supported vertices whose normals are compared with an 
 FOLD_RAD = 0.7  # a surface that turns by more within a few voxels folds over
 WEAK = 0.2  # vertices with less than this share of the median support are weak
 WEAK_PASSES = 40  # of smoothing weak vertices
-SPANNING_PASSES = 60  # of Laplacian smoothing of unseen vertices: with half as many, a closed box is 0.2 % larger
+PASSES = 60  # of fitting vertices to normals, and of smoothing unseen ones: with half as many, a box is 0.2 % larger
 PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxels
 EDGE = 4.685  # sd of the differences between neighbouring normals that make an edge: Tukey's, of 95 % efficiency
 GUIDE_PASSES = 10  # of smoothing normals before edges are sought
 DIFFUSION_PASSES = 200  # of normals over neighbouring triangles: some 15 triangles far
-FITTING_PASSES = 60  # of vertices to normals
-FLATTENING_PASSES = 50  # at most, of the smoothing that shows how smoothed views flatten surface
 
 
 def without_pinches(field: DistanceField) -> DistanceField:
@@ -345,7 +343,7 @@ def without_relief(vertices_m: Array, triangles: Triangles, limits_m: Array) -> 
     if not sigma > 0.0:
         return vertices_m
     normals = relief.diffused(normals, guide, areas, across, EDGE * sigma, DIFFUSION_PASSES)
-    return relief.fitted(vertices_m, triangles, normals, limits_m, FITTING_PASSES)
+    return relief.fitted(vertices_m, triangles, normals, limits_m, PASSES)
 
 
 def flattened_m(vertices_m: Array, triangles: Triangles, normals: Array, moment_m2: float) -> Array:
@@ -364,7 +362,7 @@ def flattened_m(vertices_m: Array, triangles: Triangles, normals: Array, moment_
     corners = vertices_m[triangles]
     edge_m2 = float(np.mean(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2)))
     # The mean over a ring of radius r has a variance of r²/2 along either axis; half a step towards it, r²/4.
-    passes = min(int(np.ceil(moment_m2 / (0.25 * edge_m2))), FLATTENING_PASSES)
+    passes = min(int(np.ceil(moment_m2 / (0.25 * edge_m2))), PASSES)
     reached_m2 = passes * 0.25 * edge_m2
     step, scale = 0.5 * min(moment_m2 / reached_m2, 1.0), max(moment_m2 / reached_m2, 1.0)
     mean = _means(_neighbours(triangles), len(vertices_m))

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.ndimage import laplace, minimum_filter
 
 from modeler.fusion.depth_views import BATCH, GREY, DepthViews, ViewBlocks
+from modeler.fusion.meshing import FAINT
 from modeler.kernels import tsdf
 from modeler.kernels.photometric import HARMONICS, harmonics_of
 from modeler.types import Array, BoolArray
@@ -16,7 +17,6 @@ from modeler.types import Array, BoolArray
 CLIPPED = 12.0  # levels from 0 and from 255 within which a pixel may be clipped: 5 % at either end
 LOOKUPS = 100_000  # points times views at which colours are compared, which bounds time
 ROUNDS = 8  # of iteratively reweighted least squares
-LEAST = 1e-3  # weight of the shading itself relative to that of the residuals; λ of eq. 12.11
 COLOUR_SIGMA = 0.1  # scale of the Cauchy weights on log colours, against highlights, and prior sd of log gains
 
 
@@ -96,8 +96,8 @@ def _fitted(logs: Array, observed: Array, basis: Array) -> tuple[Array, Array]:
     gains, shading = np.zeros((len(logs), 3)), np.zeros((basis.shape[2], 3))
     weights = observed
     # Differences between points that are the same in all views, as along the axis of a turntable, are not shading: of
-    # all solutions that explain the colours equally well, the one with the least shading is chosen.
-    least = LEAST * np.tensordot(observed[..., None] * basis, basis, ((0, 1), (0, 1))) + LEAST * np.eye(basis.shape[2])
+    # all solutions that explain the colours equally well, the one with the least shading is chosen (λ of eq. 12.11).
+    least = FAINT * np.tensordot(observed[..., None] * basis, basis, ((0, 1), (0, 1))) + FAINT * np.eye(basis.shape[2])
     for _ in range(ROUNDS):
         shares = weights / np.maximum(weights.sum(axis=0), 1e-12)
         off, relief = _centred(logs, shares), _centred(basis, shares)

@@ -131,7 +131,7 @@ def cleaned(
     shown = away_m < voxel_m
     means = meshing.neighbour_means(triangles, len(vertices_m))
     vertices_m = meshing.taubin_smoothed(vertices_m, means, passes)
-    vertices_m = meshing.laplacian_smoothed(vertices_m, means, ~shown, meshing.SPANNING_PASSES)
+    vertices_m = meshing.laplacian_smoothed(vertices_m, means, ~shown, meshing.PASSES)
     # Support is weak along the seam.
     seam = meshing.dilated(shown, triangles, 1) & meshing.dilated(~shown, triangles, 1)
     vertices_m = meshing.laplacian_smoothed(vertices_m, means, seam, SEAM)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from modeler import se3
-from modeler.closure.consistency import widest_rotation
+from modeler.closure.consistency import Thresholds, widest_rotation
 from modeler.fusion import Fuser, FusionVolume, Matcher, conditional_covariances
 from modeler.fusion.meshing import COARSE_VOXELS
 from modeler.graph import PoseGraph, solve
@@ -44,7 +44,6 @@ from modeler.types import (
 
 ALIGNMENT_SIGMA_RAD = 0.12  # standard deviation of the alignment of a model with another, or with a frame
 ALIGNMENT_SIGMA = 0.15  # of its shift, in units of the object's size
-_OPEN_SHARE = 0.5  # of the first: with more, the images add less than three times the information of the alignment
 _MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment; beyond, it is at another mode
 _MIN_ALIGNMENTS: Final = 4  # about which pairs of views are registered
 _MAX_ALIGNMENTS: Final = 24  # as many ways has a cube to match its shape, of which print tells one
@@ -272,7 +271,7 @@ class Joiner:
             return Edge(posterior, "join", False, ElsewhereThanSegments(float(np.degrees(away_rad))))
         pair = self._pair(*views)
         sigma_rad, _ = widest_rotation(posterior)
-        if sigma_rad > _OPEN_SHARE * self.sigma_rad:
+        if sigma_rad > Thresholds.known_share * self.sigma_rad:  # the images add too little to the alignment
             return Edge(posterior, "join", False, OpenRotation(float(np.degrees(sigma_rad))))
         if not pair.fits(posterior.pose.mean, self._search.fine_m(pair)):  # method, eq. 6.5
             return Edge(posterior, "join", False, Failed(Outcome.NO_OVERLAP, posterior.overlap))

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from modeler.closure import Placement
-from modeler.fusion import conditional_covariances, widened
+from modeler.fusion import conditional_covariances
 from modeler.graph import MovingGraph, estimate_focal_length
 from modeler.pipeline.attempts import Stage
 from modeler.pipeline.correcting import (
+    CELL,
     MAX_ROUNDS,
+    Majority,
     Realigner,
     contradicting,
     joined,
@@ -30,7 +32,6 @@ from modeler.pipeline.correcting import (
 from modeler.pipeline.newest import with_last
 from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import Placed, State
-from modeler.pipeline.still_scene import CELL, Majority
 from modeler.segmentation import Scene
 from modeler.significance import QUORUM
 from modeler.system.concurrency import prefetching
@@ -52,6 +53,7 @@ from modeler.types import (
 )
 from modeler.verdict import judged
 from modeler.verdict.evidence import FreeSpace
+from modeler.verdict.spreads import widened
 
 if TYPE_CHECKING:
     from modeler.pipeline.modeler import Modeler

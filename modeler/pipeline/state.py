@@ -13,6 +13,7 @@ from modeler.closure import MapView, PathNetwork
 from modeler.graph import CommonAxis, PoseGraph, Smoother, shared_noise, variance_factor
 from modeler.graph.smoother import OUTLIER_DISTANCE
 from modeler.pipeline.pairs import Prepared
+from modeler.priors.proposals import MAX_STEPS
 from modeler.registration.posterior import of_multipath
 from modeler.system.disk_arrays import ViewStore
 from modeler.types import (
@@ -29,8 +30,7 @@ from modeler.types import (
 )
 from modeler.views import Sensor
 
-_READY_BYTES, _MIN_READY = 128 * 2**20, 8  # of views whose images stay in memory: 13 of 640 × 480, at least 8
-_REVISITED = 3  # largest distance in frames between a lost frame and the later view against which it is retried
+_READY_BYTES = 128 * 2**20  # of views whose images stay in memory: 13 of 640 × 480, at least one
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,9 +343,9 @@ class State:
         return 1.0 - float(np.mean(shares)) / 6.0 if shares else 1.0
 
     def retries(self) -> Iterator[tuple[int, int]]:
-        """Yield lost frames, newest first, each with the next accepted view, if that followed within a few frames."""
+        """Yield lost frames, newest first, each with the next accepted view, if that followed within `MAX_STEPS`."""
         for frame in sorted(self.lost, key=lambda frame: -self.places[frame]):
-            after = [view for view in self.views if 0 < self.places[view] - self.places[frame] <= _REVISITED]
+            after = [view for view in self.views if 0 < self.places[view] - self.places[frame] <= MAX_STEPS]
             if after:
                 yield frame, min(after, key=lambda view: self.places[view])
 
@@ -389,7 +389,7 @@ def newest_ready(views: Mapping[int, RayImage]) -> dict[int, RayImage]:
     kept, size = [], 0
     for frame, view in reversed(list(views.items())):
         size += sum(image.nbytes for image in view.layers.values())
-        if size > _READY_BYTES and len(kept) >= _MIN_READY:
+        if size > _READY_BYTES and kept:
             break
         kept.append((frame, view))
     return dict(reversed(kept))

@@ -12,6 +12,8 @@ from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Pos
 
 FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
 """Added to sample covariances (6, 6) of ξ (rad, m), so that they are positive definite."""
+NEGLIGIBLE_VARIANCE = 1e-4
+"""Relative to what is expected: a hundredth of a standard deviation, as of images without noise."""
 MIN_MODE_SHARE = 0.005
 """Modes of less posterior probability are negligible."""
 PRIOR_SAMPLES = 500

@@ -14,7 +14,7 @@ import numpy as np
 from modeler import se3
 from modeler.composition.compose import comes_back
 from modeler.export import RunFolder, RunMeta, locked
-from modeler.fusion import Fuser, conditional_covariances, widened
+from modeler.fusion import Fuser, conditional_covariances
 from modeler.graph import PoseGraph
 from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.pairs import Registrations
@@ -22,6 +22,7 @@ from modeler.registration import VisibilityRegistrar
 from modeler.runs.reopening import Part, Reopened, renumbered, reopened, solved
 from modeler.types import Edge, FrameRecord, InputError, Outcome, RayImage, Segmentation, Solution, Step, Verdict
 from modeler.verdict import judged
+from modeler.verdict.spreads import widened
 from modeler.viz.stream import open_stream
 
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from modeler.composition import compose
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
 from modeler.export import RunFolder, edges_of, poses_of
-from modeler.fusion import Fuser, FusionVolume, conditional_covariances, widened
+from modeler.fusion import Fuser, FusionVolume, conditional_covariances
 from modeler.graph import MovingGraph, PoseGraph, Smoother
 from modeler.pipeline import Modeler
 from modeler.pipeline.pairs import SEGMENTED
@@ -30,6 +30,7 @@ from modeler.sequences import (
     read_noise,
 )
 from modeler.types import ACCEPTED, AbstractPrior, Array, BoolArray, Edge, InputError, ObjectModel, RayImage, Solution
+from modeler.verdict.spreads import widened
 from modeler.views import Sensor
 
 _Options = TypeVar("_Options", PriorOptions, MethodOptions, ObjectOptions)

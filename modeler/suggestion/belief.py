@@ -15,7 +15,7 @@ from modeler.graph.focal import LIMIT_STEPS
 from modeler.priors import PokePrior, turntable_in
 from modeler.priors.mixtures import Gaussian
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
-from modeler.registration.visibility.points import point_rows
+from modeler.registration.visibility.directed import point_rows
 from modeler.suggestion.candidates import Candidate
 from modeler.suggestion.edge_prediction import TURNS_RAD, USUAL_NOISE, EdgePredictor, PredictedEdge, PredictedView
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information

@@ -17,9 +17,8 @@ from modeler import se3
 from modeler.kernels import point_to_plane, scores
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration.posterior import PRIOR_SAMPLES, weighted_gaussian
-from modeler.registration.visibility.directed import DirectedLikelihood
+from modeler.registration.visibility.directed import DirectedLikelihood, FixedPattern
 from modeler.registration.visibility.likelihood import MatchNoise, PairLikelihood, VisibilityLikelihood
-from modeler.registration.visibility.points import FixedPattern
 from modeler.registration.visibility.refinement import Refiner, visible_share
 from modeler.registration.visibility.search import Search
 from modeler.se3 import rows

@@ -13,9 +13,8 @@ from modeler import se3
 from modeler.kernels import point_likelihood
 from modeler.kernels.gauss_newton import Regulariser
 from modeler.registration import VisibilityLikelihood, VisibilityRegistrar
-from modeler.registration.visibility.directed import DirectedLikelihood
+from modeler.registration.visibility.directed import DirectedLikelihood, FixedPattern, points_of, spread_points
 from modeler.registration.visibility.likelihood import DESCENT_STRIDE, PairLikelihood
-from modeler.registration.visibility.points import FixedPattern, points_of, spread_points
 from modeler.registration.visibility.search import Search
 from modeler.tracking.rendering import COARSE_PX, MOST_PX, ModelRenderer
 from modeler.types import Array, Camera, RayImage

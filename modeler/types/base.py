@@ -25,8 +25,8 @@ class InputError(Exception):
     """Unusable input, in one line: what is wrong, where, and what to do. Commands exit with status 2."""
 
 
-SOME_VIEWS: Final = 20
-"""Of a run, evenly spread, that stand for all of its views: one every 18° of a turn."""
+SOME_VIEWS: Final = 24
+"""Of a run, evenly spread, that stand for all of its views: one every 15° of a turn."""
 SOME_POINTS: Final = 400
 """Of a surface, by which a share of it is estimated: the standard deviation of a share of 0.1 is then 0.015."""
 

@@ -13,7 +13,6 @@ from modeler.types.base import Array, Outcome
 
 _NO_POSES = np.zeros((0, 4, 4))
 _NO_WEIGHTS = np.zeros(0)  # shared: empty arrays of its own take an edge half a kilobyte
-_APART = 2.0  # standard deviations: the sum of two equal Gaussians whose means are nearer has one peak
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,14 +119,14 @@ class Posterior:
 
 
 def are_separate(modes: Sequence[Mode]) -> bool:
-    """Return whether any mode is farther from the first than two equal Gaussians with a single peak may be."""
+    """Return whether any mode is farther from the first than two equal Gaussians with a single peak may be: 2 sd."""
     if len(modes) < 2:
         return False
     first, *others = (mode.pose for mode in modes)
     xi = se3.log(se3.inverse(first.mean) @ np.stack([other.mean for other in others]))
     spread = 0.5 * (first.covariance + np.stack([other.covariance for other in others]))
     squares = np.sum(xi * np.linalg.solve(spread, xi[..., None])[..., 0], axis=-1)
-    return bool(squares.max() > _APART**2)
+    return bool(squares.max() > 2.0**2)
 
 
 def pooled(modes: Sequence[Mode], weights: Array | None = None) -> PoseGaussian:

@@ -10,9 +10,9 @@ import numpy as np
 
 from modeler import se3
 from modeler.priors import AutoPrior, GeneralPrior, TablePrior, TurntablePrior, turntable_in
-from modeler.significance import QUORUM, SIGMAS
+from modeler.significance import OUTSIDE, QUORUM, SIGMAS
 from modeler.types import ACCEPTED, AbstractPrior, Array, Failed, Outcome, Posterior, Reason, advice
-from modeler.verdict.evidence import MAX_UNSURE, WRONG_SHARE
+from modeler.verdict.evidence import MAX_UNSURE
 
 _ROUGH: Final = (
     0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
@@ -127,7 +127,7 @@ def _sure_turns_deg(edges: Sequence[Mapping[str, Any]]) -> tuple[Array, float]:
         gaps = edge["source"] - edge["target"]
         weights = [(mode["weight_in_graph"] or 0.0) for mode in edge["modes"] if mode["weight_in_graph"] is not None]
         weights = weights or [mode["weight"] for mode in edge["modes"]]
-        if abs(gaps) == gap and max(weights, default=1.0) >= (1.0 - WRONG_SHARE) * sum(weights):
+        if abs(gaps) == gap and max(weights, default=1.0) >= (1.0 - OUTSIDE) * sum(weights):
             turns.append(np.degrees(se3.log(np.reshape(edge["target_from_source"], (4, 4)))[:3]) / gaps)
             rotation = np.reshape(edge["covariance"], (6, 6))[:3, :3]
             sigmas_deg.append(float(np.degrees(np.sqrt(np.linalg.eigvalsh(rotation)[-1]))) / gap)

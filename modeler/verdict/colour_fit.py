@@ -20,6 +20,7 @@ from modeler import se3
 from modeler.closure.consistency import MIN_TURN_DEG, Thresholds
 from modeler.kernels.photometric import displaced_correlations
 from modeler.priors import GeneralPrior
+from modeler.registration.visibility.likelihood import DESCENT_STRIDE
 from modeler.registration.visibility.photometric import LOGS
 from modeler.significance import RARE
 from modeler.types import FLIPS, SOME_POINTS, Array, BoolArray, Check, Flip, RayImage, spread
@@ -32,7 +33,6 @@ MIN_SHARED: Final = 60  # points of a pair: the sd of a chance correlation is th
 _MARGIN: Final = 4.0  # widths of the fine band: nearer to its outline, a feature is of the background
 _WIDTH: Final = 0.01  # of the object's extent in px: width of the fine band, at least a pixel
 _COARSE: Final = 2.0  # ratio of the widths of the two bands, and of the steps of the search to the finer one
-_STRIDE: Final = 4  # every fourth point is used for the search: 12 pairs have a thousand
 _REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: baselines of 15 to 50 mm at half a metre
 _LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
@@ -300,7 +300,7 @@ class Comparison:
         """Return the best displacement and its correlation; alignment if none is significantly better."""
         fine_px, coarse_px, here = self.width_px, _COARSE * self.width_px, Displacement()
         grid = list(self._grid(coarse_px))
-        scores = self.correlations(grid, coarse_px, stride=_STRIDE).mean(axis=1)
+        scores = self.correlations(grid, coarse_px, stride=DESCENT_STRIDE).mean(axis=1)
         order = np.argsort(-scores, kind="stable")
         some = self.correlations([grid[k] for k in order[:: max(len(order) // 100, 1)]], fine_px).mean(axis=1)
         chance = float(np.median(np.abs(some))) / float(ndtri(0.75))  # of normal variables

@@ -11,7 +11,8 @@ from scipy import ndimage
 from scipy.special import chdtri
 
 from modeler import se3
-from modeler.significance import RARE, SELDOM, SIGMAS, radius
+from modeler.fusion import Fuser
+from modeler.significance import OUTSIDE, RARE, SELDOM, SIGMAS, radius
 from modeler.types import (
     SOME_POINTS,
     AbstractPoseDensity,
@@ -43,16 +44,12 @@ TOLERANCE_SDS: Final = 2.5
 """The least default tolerance, in standard deviations of the camera's range noise, which one pixel in 80 exceeds."""
 WRONG_RAD: Final = np.radians(3.0)
 """Error above which a rotation is called wrong."""
-WRONG_SHARE: Final = 0.05
-"""Largest probability that a pose is wrong: the complement of 95 % regions."""
-MAX_OTHER_MODE: Final = WRONG_SHARE
-"""Largest probability that some pair is at another mode: the complement of 95 % regions."""
 
 _DRAWS: Final = 1000  # of a prior: the best of them lies 0.2 nats below the mode of a Gaussian in six dimensions
 MAX_VIEWS: Final = 40  # compared with each other, spread over the run: 1,600 pairs take a second
 _MIN_POINTS: Final = 200  # per frame observed by others: standard deviation of its share is then 0.02
 _MIN_JUDGED: Final = 100  # points of a frame observed by two others or more: a share of 0.02 is two of them
-_MARGIN_PX: Final = 2  # pixels at depth edges mix foreground and background
+_MARGIN_PX: Final = Fuser.margin_px  # as what carves: pixels at depth edges mix foreground and background
 _MIN_COSINE: Final = 0.5  # beyond 60° range noise grows with slope
 
 
@@ -280,7 +277,7 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
         settled *= float(np.sum(np.asarray(weights)[alike]) / np.sum(weights))
     for share in {edge.reason.share for edge in edges if isinstance(edge.reason, JoinsSegments)}:
         settled *= share
-    return Check(1.0 - settled, MAX_OTHER_MODE)
+    return Check(1.0 - settled, OUTSIDE)
 
 
 @dataclass(frozen=True, eq=False)

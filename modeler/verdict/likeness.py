@@ -19,6 +19,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from modeler import se3
+from modeler.kernels.point_likelihood import MIN_AGREEMENT
 from modeler.priors.general import LARGE_DEG
 from modeler.significance import RARE, nats_from_mode
 from modeler.types import SOME_POINTS, AbstractPrior, Array, Check, InputError, RayImage, components, spread
@@ -38,7 +39,6 @@ _CLEAR_DEG: Final = 30.0  # largest rotation at which print of right poses agree
 _FAINT: Final = 0.015**2  # variance of a logarithm: a plain body before a strong pattern shows 0.010² of it
 _FLAT_DEG: Final = 25.0  # from their mean: normals of a flat face are noisy, the next face of a body is farther
 _BESIDE: Final = 0.05  # of matching surface that faces elsewhere: right runs 0.05 and more, false matches 0.00 to 0.04
-_AGREEING: Final = 0.8  # cosine of normals that match, as in registration
 _UPRIGHT: Final = 0.7  # cosine of 45°: a face nearer to the support than to its normal is no side
 
 
@@ -137,7 +137,7 @@ def _matching(view: RayImage, other: RayImage, some: npt.NDArray[np.int64], moti
     seen = numbers < len(view.points_m)
     there = numbers[seen]
     near = np.abs(view.points_m[there, 2] - moved_m[seen, 2]) <= tolerance_m
-    near &= (view.normals[there] * turned[seen]).sum(axis=1) >= _AGREEING
+    near &= (view.normals[there] * turned[seen]).sum(axis=1) >= MIN_AGREEMENT
     return np.asarray(normals[seen][near], dtype=np.float64)
 
 

@@ -1,4 +1,4 @@
-"""The uncertainty of a run's poses and of its model's size."""
+"""The uncertainty of a run's poses, of its model's size, and of the surface fused under these poses."""
 
 from __future__ import annotations
 
@@ -11,8 +11,22 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from modeler import se3
-from modeler.types import SOME_POINTS, SOME_VIEWS, Array, Check, Edge, FocalLength, RayImage, Solution, spread
-from modeler.verdict.evidence import MAX_VIOLATIONS, WRONG_RAD, WRONG_SHARE, graph_check
+from modeler.fusion import Fuser
+from modeler.fusion.depth_views import BATCH
+from modeler.significance import OUTSIDE
+from modeler.types import (
+    SOME_POINTS,
+    SOME_VIEWS,
+    Array,
+    Check,
+    Edge,
+    FocalLength,
+    ObjectModel,
+    RayImage,
+    Solution,
+    spread,
+)
+from modeler.verdict.evidence import MAX_VIOLATIONS, WRONG_RAD, graph_check
 
 _NODES: Final = 24  # of quadrature along an axis: shares of 5 % are then accurate to 0.1 %
 
@@ -24,7 +38,7 @@ class Spread:
     frame: int
     """Frame number."""
     check: Check
-    """Standard deviation, see `one_axis_sd`. At the limit, a Gaussian is wrong with probability `WRONG_SHARE`."""
+    """Standard deviation, see `one_axis_sd`. At the limit, a Gaussian is wrong with probability `OUTSIDE`."""
     count: int
     """Number of frames beyond the limit."""
     by_focal_m: float = 0.0
@@ -215,7 +229,7 @@ def one_axis_sd(covariance: Array, wrong: float) -> float:
 
 def _widest(sigmas: Mapping[int, float], wrong: float) -> Spread | None:
     """Return the largest standard deviation by frame number; `wrong` is the error above which a pose is wrong."""
-    limit = wrong / float(-ndtri(WRONG_SHARE / 2.0))
+    limit = wrong / float(-ndtri(OUTSIDE / 2.0))
     worst = max(sigmas, key=lambda frame: sigmas[frame], default=None)
     if worst is None:
         return None
@@ -257,3 +271,71 @@ def size_check(
     surface_m = np.concatenate(surfaces_m) if surfaces_m else np.zeros((1, 3))
     reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_VIOLATIONS)
     return Check(scale_sigma * float(reach_m), tolerance_m)
+
+
+def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
+    """Return a model whose vertex uncertainty includes that of poses and focal length (method, eq. 12.9).
+
+    Errors that move the model as a whole are no uncertainty of its surface.
+
+    Args:
+        model: fused under the solution's poses.
+        solution: with covariances of motions; without these, poses count as exact.
+    """
+    frames = spread(list(solution.trajectory), SOME_VIEWS)
+    if model.vertex_sigmas_m is None or not (solution.focal or solution.knows_motions) or len(frames) == 0:
+        return model
+    shares = _shares_of_views(model, [solution.trajectory[frame] for frame in frames])
+    variances_m2 = np.zeros(len(shares))
+    if solution.focal is not None:
+        variances_m2 += (solution.focal.sigma * _moved_by_focal(model, shares, solution, solution.focal, frames)) ** 2
+    if solution.knows_motions and len(frames) > 1:
+        variances_m2 += _of_poses(model, shares, solution, frames)
+    return replace(model, vertex_sigmas_m=np.sqrt(model.vertex_sigmas_m**2 + variances_m2))
+
+
+def _shares_of_views(model: ObjectModel, poses: Sequence[Array]) -> Array:
+    """Return the share (v, f) of each view in each vertex: its cosine, as far as it contributes to the mesh."""
+    shares = np.zeros((len(model.vertices_m), len(poses)))
+    for k, object_from_camera in enumerate(poses):
+        rays = object_from_camera[:3, 3] - model.vertices_m
+        cosines = np.sum(model.vertex_normals * rays, axis=1) / np.linalg.norm(rays, axis=1)
+        shares[:, k] = np.where(cosines >= Fuser.min_cosine, cosines, 0.0)
+    totals = shares.sum(axis=1, keepdims=True)
+    return np.divide(shares, totals, out=np.zeros_like(shares), where=totals > 0.0)
+
+
+def _moved_by_focal(
+    model: ObjectModel, shares: Array, solution: Solution, focal: FocalLength, frames: Sequence[int]
+) -> Array:
+    """Return by how much (v,) in m vertices move along their normals if the logarithm of the focal length is 1 off."""
+    moved_m = np.zeros(len(shares))
+    for share, frame in zip(shares.T, frames, strict=True):
+        object_from_camera, by_focal = solution.trajectory[frame], focal.by_focal.get(frame, np.zeros(6))
+        points_m = se3.transform(se3.inverse(object_from_camera), model.vertices_m)
+        drawn = (points_m * (-1.0, -1.0, 0.0)) @ object_from_camera[:3, :3].T
+        shift = drawn + np.cross(by_focal[:3], model.vertices_m) + by_focal[3:]
+        moved_m += share * np.sum(model.vertex_normals * shift, axis=1)
+    return moved_m
+
+
+def _of_poses(model: ObjectModel, shares: Array, solution: Solution, frames: Sequence[int]) -> Array:
+    """Return the variance (v,) in m² along the normals by errors of poses relative to the mean of all poses.
+
+    With errors η of poses in the object frame, surface moves by J Σ b η, where b are shares less those of the mean.
+    As Σ b = 0, its variance is -Σ b_i b_j J C_ij Jᵀ over pairs, C being the covariance of η_i - η_j.
+    """
+    upper, (first, second) = np.triu_indices(6), np.triu_indices(len(frames), 1)
+    packed = np.empty((21, len(first)))
+    for column, (i, j) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        turned = se3.adjoint(solution.trajectory[frames[j]])
+        packed[:, column] = (turned @ solution.deforming_covariance(frames[i], frames[j]) @ turned.T)[upper]
+    twice = np.where(upper[0] == upper[1], 1.0, 2.0)
+    variances_m2 = np.zeros(len(shares))
+    for some in np.array_split(np.arange(len(shares)), max(-(-len(shares) * len(first) // BATCH), 1)):
+        normals, apart = model.vertex_normals[some], shares[some] - 1.0 / len(frames)
+        rows = np.concatenate([np.cross(model.vertices_m[some], normals), normals], axis=1)
+        squares = (twice * rows[:, upper[0]] * rows[:, upper[1]]) @ packed
+        variances_m2[some] = -np.sum(squares * apart[:, first] * apart[:, second], axis=1)
+    seen = shares.any(axis=1)
+    return np.where(seen, np.maximum(variances_m2, 0.0), 0.0)

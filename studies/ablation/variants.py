@@ -12,8 +12,8 @@ import numpy as np
 
 from modeler.registration import VisibilityRegistrar
 from modeler.registration.visibility import directed, ridge
+from modeler.registration.visibility.directed import FixedPattern
 from modeler.registration.visibility.likelihood import PairLikelihood, VisibilityLikelihood
-from modeler.registration.visibility.points import FixedPattern
 from modeler.types import Array, RayImage
 
 Kind = Literal["default", "removed", "halved", "doubled"]

@@ -18,8 +18,7 @@ from scipy.spatial import KDTree
 
 from modeler import evaluation, se3
 from modeler.system.pictures import encoded
-from modeler.types import ACCEPTED, Array, Edge, Outcome, explain
-from modeler.verdict.evidence import MAX_POINTS
+from modeler.types import ACCEPTED, SOME_POINTS, Array, Edge, Outcome, explain
 from modeler.viz import entities
 from modeler.viz.blueprint import FROM_THE_SIDE
 from modeler.viz.reader import FRAME_PATHS
@@ -304,7 +303,7 @@ def _mark(pixels: Array, marks: Marks, box: Array, area: int) -> None:
     """
     height, width = pixels.shape[:2]
     scale = width / (box[2] - box[0])
-    reach = max(1.0, 0.5 * np.sqrt(area / MAX_POINTS))  # so that neighbouring points touch
+    reach = max(1.0, 0.5 * np.sqrt(area / SOME_POINTS))  # so that neighbouring points touch
     rows, columns = np.mgrid[:height, :width]
     for rgb, places in zip(_MARKS_RGB, marks.places, strict=True):
         centres = (places[:, ::-1] - box[:2]) * scale

@@ -15,9 +15,9 @@ from modeler.kernels.gauss_newton import Regulariser
 from modeler.kernels.photometric import NO_COLOURS, Colours
 from modeler.kernels.point_likelihood import Projection
 from modeler.registration.posterior import rows_under
-from modeler.registration.visibility.directed import MISFIT, DirectedLikelihood
-from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
-from modeler.registration.visibility.points import (
+from modeler.registration.visibility.directed import (
+    MISFIT,
+    DirectedLikelihood,
     FixedPattern,
     IntArray,
     by_motion,
@@ -25,6 +25,7 @@ from modeler.registration.visibility.points import (
     significant_variances,
     spread_points,
 )
+from modeler.registration.visibility.photometric import ASSUMED_RHO, PairColour, correlations, weight_of, without_shift
 from modeler.se3 import matrices, rows
 from modeler.significance import UNLIKELY
 from modeler.types import Array, RayImage

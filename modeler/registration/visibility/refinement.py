@@ -15,16 +15,14 @@ import numpy as np
 
 from modeler import se3
 from modeler.kernels import point_to_plane
-from modeler.registration.posterior import FLOOR, KNOWN, FocalNuisance
-from modeler.registration.visibility.directed import DirectedLikelihood
+from modeler.registration.posterior import FLOOR, KNOWN, NEGLIGIBLE_VARIANCE, FocalNuisance
+from modeler.registration.visibility.directed import OWN_RIM, DirectedLikelihood, FixedPattern, IntArray, by_motion
 from modeler.registration.visibility.likelihood import MatchNoise, PairLikelihood
 from modeler.registration.visibility.photometric import without_shift
-from modeler.registration.visibility.points import OWN_RIM, FixedPattern, IntArray, by_motion
 from modeler.registration.visibility.sampling import WeightedSamples
 from modeler.se3 import rows
 from modeler.types import Array, Camera
 
-_MIN_LEVEL = 1e-4  # of the scatter relative to its shape: residuals of a hundredth of their predicted sd
 _STEP_SIGMAS = 0.1  # of the samples, at which iterations end; a last step follows; 0.01 moves means by 0.02 to 0.05 sd
 
 
@@ -141,7 +139,7 @@ def shrunk(scores: Array, shape: Array) -> Array:
     root = np.linalg.cholesky(shape + max(1e-9 * np.trace(shape), 1e-300) * np.eye(size))
     white = np.linalg.solve(root, scores.T)
     scatter = white @ white.T * count / (count - 1.0)
-    level, square = max(np.trace(scatter) / size, _MIN_LEVEL), np.sum(scatter**2)
+    level, square = max(np.trace(scatter) / size, NEGLIGIBLE_VARIANCE), np.sum(scatter**2)
     departure = (count + 1.0 - 2.0 / size) * (square - size * level**2)
     chance = (1.0 - 2.0 / size) * square + (size * level) ** 2
     share = chance / max(chance, departure, 1e-300)

@@ -15,6 +15,7 @@ from modeler.registration.posterior import (
     FLOOR,
     KNOWN,
     MIN_MODE_SHARE,
+    NEGLIGIBLE_VARIANCE,
     FocalNuisance,
     effective_samples,
     normalised,
@@ -30,7 +31,6 @@ _INFLATION, _WIDE_FRACTION = 2.0, 0.3  # a fifth fewer rounds on a printed carto
 _PER_ROUND = 4  # a round draws a quarter of the samples so far, or more: it goes through all; 28 % less for a carton
 _EM_STEPS, _MEAN_STEPS = 4, 2  # proposals need no convergence
 _MIN_PART = 0.05  # of the weight: the few samples of a smaller part do not determine a Gaussian
-_WHITE_FLOOR = 1e-4  # of variances in whitened coordinates
 _LEAST_POWER = 0.5  # of the weights of a result: variances are at most doubled
 
 
@@ -315,7 +315,7 @@ def _fitted_two(poses: Array, weights: Array, centre_m: Array) -> GaussianMixtur
     core = np.zeros(len(weights))
     core[near[np.cumsum(weights[near]) <= 0.5 * weights.sum()]] = 1.0
     members = weights * np.stack([core, 1.0 - core])
-    if not mixture.separate_two(white, weights, members, _EM_STEPS, _MIN_PART, _WHITE_FLOOR):
+    if not mixture.separate_two(white, weights, members, _EM_STEPS, _MIN_PART, NEGLIGIBLE_VARIANCE):
         return one
     parts = [_fitted(poses, of / of.sum(), centre_m).times(0.5) for of in members]
     return parts[0].plus(parts[1])
