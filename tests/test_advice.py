@@ -181,8 +181,10 @@ def test_the_command_to_try_keeps_what_was_given() -> None:
         "modeler build 'a b' --out run --overwrite --prior table --max-shift-m 0.1 --roi 1 2 3 4"
     )
     assert build.command({"prior": "general"}) == "modeler build 'a b' --out run --overwrite --prior general"
-    build = Build(Path("a"), Path("run"), where=ObjectOptions(roi=(1, 2, 3, 4)), method=MethodOptions(seed=3))
-    assert build.command({}) == "modeler build a --out run --overwrite --roi 1 2 3 4 --seed 3"
+    build = Build(
+        Path("a"), Path("run"), where=ObjectOptions(roi=(1, 2, 3, 4)), method=MethodOptions(seed=3, colour=False)
+    )
+    assert build.command({}) == "modeler build a --out run --overwrite --roi 1 2 3 4 --no-colour --seed 3"
 
 
 def test_messages_name_parameters_and_options_that_exist() -> None:

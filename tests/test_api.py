@@ -6,7 +6,6 @@ import doctest
 import inspect
 import json
 import os
-import pydoc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -77,18 +76,6 @@ def test_every_public_name_is_there_and_documented() -> None:
     assert all(getattr(modeler, name).__doc__ for name in modeler.__all__)
     with pytest.raises(AttributeError, match="nothing_such"):
         _ = modeler.nothing_such  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_help_tells_frames_units_and_functions() -> None:
-    text = pydoc.plain(pydoc.render_doc(modeler))
-    for words in (
-        "target_from_source",
-        "Lengths are in m",
-        "register(source_depth_m",
-        "build(sequence",
-        "class Modeler",
-    ):
-        assert words in text
 
 
 def test_a_model_is_never_built_into_its_sequence() -> None:

@@ -25,12 +25,6 @@ def _about_centroid(xi: Array) -> Array:
     return se3.translation(CENTROID_M) @ se3.exp(xi) @ se3.translation(-CENTROID_M)
 
 
-def test_errors_of_the_truth_are_zero() -> None:
-    truth = se3.exp(np.random.default_rng(0).normal(size=6))
-    assert rotation_error_deg(truth, truth) == pytest.approx(0.0, abs=1e-6)
-    assert translation_error_m(truth, truth, CENTROID_M) == 0.0
-
-
 @pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 0.1, 12.0, 90.0, 179.9999, 180.0])
 def test_rotation_about_the_object_is_no_translation(angle_deg: float) -> None:
     truth = se3.exp(np.random.default_rng(1).normal(size=6))

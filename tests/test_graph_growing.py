@@ -89,19 +89,6 @@ def test_smoother_is_a_value() -> None:
         np.testing.assert_array_equal(again.solution.trajectory[frame], pose)
 
 
-def test_same_arrivals_same_solution_to_the_bit() -> None:
-    def last() -> Solution:
-        growing = Smoother()
-        for edges in _arrivals(np.random.default_rng(6)):
-            growing = growing.plus(edges)
-        return growing.solution
-
-    one, other = last(), last()
-    for frame in one.trajectory:
-        np.testing.assert_array_equal(one.trajectory[frame], other.trajectory[frame])
-        np.testing.assert_array_equal(one.covariances[frame], other.covariances[frame])
-
-
 def test_the_batch_optimiser_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
 

@@ -127,15 +127,14 @@ def test_a_run_that_had_ended_is_not_made_again(
     assert ({path.name: path.stat().st_mtime_ns for path in whole.iterdir()}, asked) == (before, [])
 
 
-@pytest.mark.parametrize("missing", ["frames", "reasons", "poses"])
 def test_a_run_whose_report_is_damaged_is_not_resumed(
-    scene: Path, whole: Path, tmp_path: Path, refusal: Callable[..., str], missing: str
+    scene: Path, whole: Path, tmp_path: Path, refusal: Callable[..., str]
 ) -> None:
     report = RunFolder(whole).report()
-    del report[missing]
+    del report["poses"]
     (tmp_path / "report.json").write_text(json.dumps(report))
     said = refusal("build", scene, "--out", tmp_path, *QUICK, "--resume")
-    assert said.startswith(f"modeler: {tmp_path / 'report.json'}: {missing!r} is missing")
+    assert said.startswith(f"modeler: {tmp_path / 'report.json'}: 'poses' is missing")
 
 
 def test_ctrl_c_leaves_a_model_of_the_frames_so_far_and_the_rest_can_follow(

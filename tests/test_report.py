@@ -232,14 +232,6 @@ def test_the_mask_of_every_frame_is_shown(run: Path, page: str) -> None:
         assert inside.sum() / (height * width) == pytest.approx(share, abs=0.1)
 
 
-def test_merged_points_are_those_of_the_views(run: Path) -> None:
-    views = next(step.views for step in steps(COUNT, lost=LOST) if step.last)
-    found = surfaces(recorded(run / "recording.rrd"))
-    assert found.keys() == {*views, LOST}
-    for frame, view in views.items():
-        np.testing.assert_allclose(found[frame], view.points_m, atol=1e-6)  # few enough that all are recorded
-
-
 def test_points_of_a_frame_that_is_tried_again_are_its_own(tmp_path: Path) -> None:
     taken = list(steps(4))
     again = replace(taken[2], views=taken[-1].views)  # which stands beside the latest frame on the timeline

@@ -61,7 +61,7 @@ def bracket():
     return made[later], made[earlier], true_motion(sequence.truth(), earlier, later)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_turn_may_be_found_from_nothing(bracket, seed):
     source, target, truth = bracket
     density = GeneralPrior(max_rotation_deg=180.0, max_offset_m=0.2).between(source, target)
@@ -120,7 +120,7 @@ def test_a_small_part_that_alone_determines_the_spin_is_not_blurred_away():
     sequence = RenderedSequence(staged(specimen, Condition(step_deg=40.0), frames=3, seed=1283680154))
     target, source = viewed([sequence.frame(index) for index in sequence.indices[:2]], None)
     right, density = true_motion(sequence.truth(), target.index, source.index), TablePrior().between(source, target)
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         found = Search().run(VisibilityLikelihood().between(source, target, rng), density, rng, min_overlap=MIN_OVERLAP)
         assert min(rotation_error_deg(pose, right) for pose in found.poses) < 10.0
@@ -154,7 +154,7 @@ def test_a_six_fold_shape_may_have_turned_farther():
         assert sum(shares) > 0.1  # 0.01 to 0.03 if hidden points and holes count
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_posterior_of_a_tube_spans_its_roll(seed):
     """Turning a body of revolution about its axis moves no surface: what the prior leaves open stays open."""
     source, target, truth = views("tube", source=1, target=0)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from segmentation_worlds import segmented
 from slow_cases import quick_first
 
 from modeler.evaluation import nees, rotation_error_deg, true_motion
@@ -13,7 +14,7 @@ from modeler.kernels import planes
 from modeler.pipeline import Modeler
 from modeler.priors import TablePrior
 from modeler.registration import VisibilityRegistrar
-from modeler.segmentation import Scene, Segmenter
+from modeler.segmentation import Scene
 from modeler.sequences.rendering import RenderedSequence
 from modeler.types import Camera, Frame, Outcome, SensorNoise, Step
 from modeler.views import Sensor
@@ -98,12 +99,6 @@ def test_planes_between_sparse_measurements_err_as_they_state(rng):
 def drill():
     """Return a rendered drill 1.3 m away, of three frames."""
     return RenderedSequence(staged(load_specimen("drill"), Condition(distance_m=1.3), frames=3, seed=4))
-
-
-def segmented(frames):
-    """Return segmentations of frames by what they show together."""
-    scene = Segmenter().scene(frames)
-    return [Segmenter().segment(frame, scene) for frame in frames]
 
 
 @pytest.mark.parametrize("masked", quick_first([False, True]))

@@ -112,7 +112,7 @@ def test_the_choice_of_points_moves_an_answer_by_less_than_half_its_standard_dev
     noise = sequence.sensor()
     assert noise is not None
     squares = []
-    for first in (0, 2, 4):
+    for first in (0, 4):
         target, source = (Sensor(noise).ray_image(sequence.frame(index)) for index in (first, first + 1))
         density = GeneralPrior().between(source, target)
         found = [
@@ -120,12 +120,12 @@ def test_the_choice_of_points_moves_an_answer_by_less_than_half_its_standard_dev
                 VisibilityRegistrar().register(source, target, density, rng=np.random.default_rng(seed)).pose,
                 source.centroid_m,
             )
-            for seed in range(6)
+            for seed in range(4)
         ]
         moved = np.array([se3.log(se3.inverse(found[0].mean) @ pose.mean) for pose in found])
         moved -= moved.mean(axis=0)
         stated = np.mean([pose.covariance for pose in found], axis=0)
-        squares.append(np.sum(moved * np.linalg.solve(stated, moved.T).T) / 5 / 6)
+        squares.append(np.sum(moved * np.linalg.solve(stated, moved.T).T) / 3 / 6)
     assert np.mean(squares) < 0.5**2
 
 
