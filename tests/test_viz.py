@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
-import rerun.blueprint as rrb
 import rerun.chunk
 from PIL import Image
 from rerun_recordings import MERGED, Recording, drawn, read, record
@@ -100,19 +99,6 @@ def test_a_recording_opens_with_a_layout(tmp_path: Path, run: list[Step]) -> Non
     targets = np.array([batch["EyeControls3D:look_target"][0].as_py()[0] for batch in eyes])
     assert len(targets) == 8
     assert np.linalg.norm(targets - CENTRE_M, axis=1).max() < HALF_M.max()
-
-
-def test_the_first_screen_has_three_panels(run: list[Step]) -> None:
-    for first in (None, run[0].view):
-        tabs = blueprint.layout(first).root_container
-        assert isinstance(tabs, rrb.Tabs)
-        assert tabs.active_tab == 0
-        assert [panels(tab) for tab in tabs.contents] == [3, 3, 6, 7, 3]
-        assert all(isinstance(tab, rrb.Container) and tab.name for tab in tabs.contents)
-
-
-def panels(part: rrb.Container | rrb.View) -> int:
-    return sum(panels(inner) for inner in part.contents) if isinstance(part, rrb.Container) else 1
 
 
 def test_captions_lie_below_the_object_where_its_support_is_seen(run: list[Step]) -> None:
