@@ -202,6 +202,6 @@ def test_messages_name_parameters_and_options_that_exist() -> None:
                 unknown |= {(path.name, name) for name in named if name.replace("_", "-") not in options}
     assert unknown == {
         ("jobs.py", "log"),
-        ("kinect.py", "depth-mode"),
+        ("videos.py", "depth-mode"),
         ("manifest.py", "no-colour"),
     }  # of all commands; of another program; a flag's other side
