@@ -31,7 +31,7 @@ from modeler.sequences.input_files import Node, entries, first_folder, frame_num
 from modeler.sequences.intrinsics import RANGE, Intrinsics, Overrides, of_matrix
 from modeler.sequences.meshes import Mesh, read_mesh
 from modeler.sequences.recording import AbstractRecording
-from modeler.system.regular_files import left_behind
+from modeler.system.regular_files import json_lines, left_behind
 from modeler.types import Array, BoolArray, Camera, Frame, InputError
 
 
@@ -196,7 +196,7 @@ class BopSequence(AbstractRecording):
 
     @cached_property
     def _times_s(self) -> dict[int, float]:
-        node = None if self._meta is None else self._meta.get("timestamps_s")
+        node = self.facts.get("timestamps_s")
         if node is None:
             return {index: float(index) for index in self.indices}
         given = node.frames()
@@ -328,10 +328,11 @@ def _fill(
             _image(folder / OCCLUDERS / f"{stem}.png", frame.occluder.astype(np.uint8) * np.uint8(255))
         if frame.colour is not None:
             _image(folder / "rgb" / f"{stem}{colour_suffix}", frame.colour)
-    _json(folder / "scene_camera.json", cameras)
+    (folder / "scene_camera.json").write_text(json_lines(cameras))
     if truth is not None:
-        _json(folder / "scene_gt.json", {str(index): [pose_entry(pose)] for index, pose in truth.items()})
-    _json(folder / "sequence.json", {**meta, "timestamps_s": times_s}, indent=1)
+        poses = {str(index): [pose_entry(pose)] for index, pose in truth.items()}
+        (folder / "scene_gt.json").write_text(json_lines(poses))
+    (folder / "sequence.json").write_text(json.dumps({**meta, "timestamps_s": times_s}, indent=1) + "\n")
 
 
 def _raw_depth(frame: Frame, depth_scale_mm: float) -> npt.NDArray[np.uint16]:
@@ -349,15 +350,6 @@ def _raw_depth(frame: Frame, depth_scale_mm: float) -> npt.NDArray[np.uint16]:
 def _image(path: Path, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
     path.parent.mkdir(exist_ok=True)
     write_image(path, pixels)
-
-
-def _json(path: Path, content: Mapping[str, object], indent: int | None = None) -> None:
-    if indent is None:  # one line a frame keeps the file both small and readable
-        lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
-        text = f"{{\n{lines}\n}}\n"
-    else:
-        text = json.dumps(content, indent=indent) + "\n"
-    path.write_text(text, encoding="utf-8")
 
 
 def true_mesh(sequence: AbstractSequence) -> Mesh:

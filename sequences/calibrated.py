@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 
 from modeler.sequences.base import AbstractDerived
-from modeler.sequences.input_files import Node, read_tree
+from modeler.sequences.input_files import build, read_tree
 from modeler.types import NOMINAL_FOCAL, Array, Camera, Frame, InputError, SensorNoise
 
 
@@ -53,15 +53,6 @@ class NoiseModel:
         """Return `(sigma_wh, sigma_r_m)` for a surface that faces the camera."""
         return self.sigma_wh(), float(self.sigma_r_m(distance_m))
 
-    def record(self) -> dict[str, object]:
-        """Return the model as JSON has it."""
-        return {
-            "lateral_px": self.lateral_px,
-            "focal_px": self.focal_px,
-            "floor_m": self.floor_m,
-            "growth": list(self.growth),
-        }
-
 
 def slope_terms(distance_m: Array, angle_rad: Array) -> Array:
     """Return the regressors (..., 4) of the variance along the ray: 1, z⁴, z⁴ q, z⁴ q²."""
@@ -78,24 +69,16 @@ def read_noise(path: Path) -> NoiseModel:
         InputError: if it is missing or says something else.
     """
     node = read_tree(path).need("noise")
-    growth = node.need("growth").elements()
-    if len(growth) != 3:
-        raise node.need("growth").fault("a list of 3 numbers")
-    return NoiseModel(
-        node.need("lateral_px").number(1e-6, 1e3),
-        node.need("focal_px").number(1.0, 1e6),
-        node.need("floor_m").number(0.0, 1.0),
-        (_share(growth[0]), _share(growth[1]), _share(growth[2])),
-    )
-
-
-def _share(node: Node) -> float:
-    return node.number(0.0, 1.0)
+    model = build(NoiseModel, node)
+    in_pixels = 1e-6 <= model.lateral_px <= 1e3 and 1.0 <= model.focal_px <= 1e6
+    if not in_pixels or not all(0.0 <= number <= 1.0 for number in (model.floor_m, *model.growth)):
+        raise node.fault("of positive lateral_px and focal_px, and floor_m and growth from 0 to 1")
+    return model
 
 
 def noise_text(model: NoiseModel, facts: Mapping[str, object]) -> str:
     """Return the file of a model: with the noise at the distance where it was measured, and further facts."""
-    return json.dumps({**facts, "noise": model.record()}, indent=1, allow_nan=False) + "\n"
+    return json.dumps({**facts, "noise": asdict(model)}, indent=1, allow_nan=False) + "\n"
 
 
 def object_distance_m(frame: Frame) -> float:

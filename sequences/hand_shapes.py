@@ -90,7 +90,7 @@ class HandMarkedSequence(AbstractDerived):
 
 def with_hand(sequence: AbstractSequence) -> AbstractSequence:
     """Return a sequence with the hand of its `sequence.json` masked; without one, the sequence itself."""
-    node = sequence.facts.get("hand") if isinstance(sequence, AbstractRecording) and sequence.facts else None
+    node = sequence.facts.get("hand") if isinstance(sequence, AbstractRecording) else None
     if node is None:
         return sequence
     shape = _shape(node)

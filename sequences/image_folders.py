@@ -38,7 +38,9 @@ from modeler.sequences.input_files import (
     frame_number,
     is_there,
     list_images,
+    listed,
     read_text,
+    read_tree,
 )
 from modeler.sequences.intrinsics import CameraFacts, Intrinsics, Overrides, cameras_of_frames, find_intrinsics
 from modeler.sequences.lens import Lens
@@ -212,6 +214,25 @@ def images_in_one_folder(path: Path) -> FoundImages | None:
     return FoundImages(
         by_role["depth"], by_role.get("colour", {}), by_role.get("mask", {}), {}, by_role.get("confidence", {})
     )
+
+
+def images_of_transforms(path: Path) -> FoundImages | None:
+    """Return the images that nerfstudio's `transforms.json` lists; None if it lists no depth."""
+    if not is_there(path / "transforms.json"):
+        return None
+    frames = read_tree(path / "transforms.json").get("frames")
+    shown = [] if frames is None else [frame for frame in frames.elements() if frame.get("depth_file_path")]
+    if not shown:
+        return None
+
+    def named(key: str) -> dict[str, Path]:
+        return {
+            Path(frame.need("depth_file_path").text()).stem: listed(path / "transforms.json", entry.text())
+            for frame in shown
+            if (entry := frame.get(key)) is not None
+        }
+
+    return FoundImages(named("depth_file_path"), named("file_path"), named("mask_path"))
 
 
 SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)

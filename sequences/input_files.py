@@ -112,7 +112,7 @@ def frame_number(stem: str) -> int | None:
     return int(stem) if stem.isascii() and stem.isdigit() and len(stem) <= 9 else None
 
 
-MAX_BYTES = 64_000_000  # larger text is refused
+MAX_TEXT_BYTES = 64_000_000  # larger text is refused
 
 
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -259,7 +259,7 @@ def _from_yaml(text: str) -> object:
 def read_text(path: Path, kind: str = "text") -> str:
     """Return the text of a file of at most 64 MB."""
     try:
-        return read_regular(path, MAX_BYTES).decode("utf-8-sig")
+        return read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not UTF-8 text (byte {error.start}); save it as {kind}.") from None
 

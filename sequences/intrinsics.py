@@ -126,22 +126,18 @@ class CameraFacts:
             numbers = " ".join(f"{value:g}" for value in lens.coefficients)
             kind = "fisheye lens" if lens.fisheye else "lens distortion"
             said.append(f"{kind} {numbers} ({self.by}) is taken out of depth, colour and masks")
-        return said + self.doubts(size)
+        if self.size not in (None, size):
+            said.append(
+                f"{self.by} is of images of {self.size[0]} x {self.size[1]} where the depth images are {size[0]} x "
+                f"{size[1]}: are its intrinsics theirs?"
+            )
+        return said
 
     def unit(self, overrides: Overrides, usual: tuple[float, str]) -> tuple[float, str]:
         """Return the millimetres per unit of depth, and its source."""
         if overrides.depth_scale_mm is not None:
             return overrides.depth_scale_mm, "`depth_scale_mm`"
         return usual if self.unit_mm is None else (self.unit_mm, self.by)
-
-    def doubts(self, size: tuple[int, int]) -> list[str]:
-        """Return remarks where the intrinsics are of images of another (width, height)."""
-        if self.size in (None, size):
-            return []
-        return [
-            f"{self.by} is of images of {self.size[0]} x {self.size[1]} where the depth images are {size[0]} x "
-            f"{size[1]}: are its intrinsics theirs?"
-        ]
 
 
 def find_intrinsics(folder: Path, overrides: Overrides) -> CameraFacts | None:

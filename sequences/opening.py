@@ -23,14 +23,15 @@ from modeler.sequences.image_folders import (
     DEPTH_FOLDERS,
     images_in_folders,
     images_in_one_folder,
+    images_of_transforms,
     open_colour_depth,
 )
 from modeler.sequences.input_files import check_links, entries, first_folder, is_there
 from modeler.sequences.intrinsics import Overrides
 from modeler.sequences.live import LIBRARIES, open_camera
-from modeler.sequences.phones import images_of_transforms, open_record3d
 from modeler.sequences.survey import survey
 from modeler.sequences.tum import open_tum
+from modeler.sequences.videos import open_record3d
 from modeler.system.regular_files import check_regular, unreadable
 from modeler.types import Frame, InputError, checked
 

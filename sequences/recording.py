@@ -53,7 +53,7 @@ class AbstractRecording(AbstractSequence):
     @property
     def name(self) -> str:
         """Name of the sequence: from `sequence.json`, else that of the folder or file."""
-        node = None if self._meta is None else self._meta.get("name")
+        node = self.facts.get("name")
         resolved = self.path.resolve()
         return (resolved.name if self._is_folder else resolved.stem) if node is None else node.text()
 
@@ -63,7 +63,7 @@ class AbstractRecording(AbstractSequence):
 
     def sensor(self) -> SensorNoise | None:
         """Return the noise of the camera from `sequence.json` and as the format tells it; None if neither says."""
-        node = None if self._meta is None else self._meta.get("sensor")
+        node = self.facts.get("sensor")
         by_format = SensorNoise(
             sigma_r_m=None,
             sigma_focal=CALIBRATED_FOCAL if self.calibrated else NOMINAL_FOCAL,
@@ -84,7 +84,7 @@ class AbstractRecording(AbstractSequence):
 
     @property
     def motion(self) -> Mapping[str, Any] | None:
-        node = None if self._meta is None else self._meta.get("motion")
+        node = self.facts.get("motion")
         return None if node is None else _motion(node)
 
     @property
@@ -97,10 +97,11 @@ class AbstractRecording(AbstractSequence):
         """`model.ply`, where there is one: the true surface in m."""
         return self._beside("model.ply")
 
-    @property
-    def facts(self) -> Node | None:
-        """Contents of `sequence.json`; None without one."""
-        return self._meta
+    @cached_property
+    def facts(self) -> Node:
+        """Contents of `sequence.json`; nothing without one."""
+        path = self.path / "sequence.json" if self._is_folder else self.path.with_suffix(".json")
+        return read_tree(path) if is_there(path) else Node({}, path)
 
     def absent(self, index: int) -> InputError:
         """Return the error that says that there is no frame of that number."""
@@ -114,11 +115,6 @@ class AbstractRecording(AbstractSequence):
     @cached_property
     def _is_folder(self) -> bool:
         return self.path.is_dir()
-
-    @cached_property
-    def _meta(self) -> Node | None:
-        path = self.path / "sequence.json" if self._is_folder else self.path.with_suffix(".json")
-        return read_tree(path) if is_there(path) else None
 
 
 MOTIONS = ("general", "table", "turntable", "held", "poke")  # kinds of motion, each a prior

@@ -1,4 +1,4 @@
-"""What the PyAV library reads: videos of colour, and recordings of the Azure Kinect and of cameras like it (.mkv)."""
+"""Videos of depth and colour: what PyAV reads, recordings of the Azure Kinect (.mkv) among it, and Record3D's .r3d."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import json
 import os
 import threading
 import weakref
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,14 +19,14 @@ import numpy as np
 import numpy.typing as npt
 
 from modeler import se3
-from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour
-from modeler.sequences.input_files import Node, input_errors
-from modeler.sequences.intrinsics import Intrinsics, Overrides, sane
+from modeler.sequences.image_files import MAX_PIXELS, EmbeddedImage, metres, read_colour, resize_to_depth
+from modeler.sequences.input_files import MAX_TEXT_BYTES, Node, input_errors
+from modeler.sequences.intrinsics import Intrinsics, Overrides, camera_of, sane
 from modeler.sequences.lens import Alignment, Lens, coefficients
-from modeler.sequences.recording import AbstractStreams, paired
+from modeler.sequences.recording import AbstractRecording, AbstractStreams, paired
 from modeler.system.processes import install_command
-from modeler.system.regular_files import MAX_BYTES, check_regular, open_regular
-from modeler.types import Array, Camera, InputError
+from modeler.system.regular_files import MAX_BYTES, check_regular, open_regular, parse_json
+from modeler.types import Array, Camera, Frame, InputError
 
 
 def can_decode() -> bool:
@@ -282,3 +283,95 @@ class Matroska:
             raise InputError(f"{self.path}: recordings of the Azure Kinect are read by PyAV; {how}")
         _check_whole(self.path)
         return _opened(self.path, self)
+
+
+_EXPORT_AGAIN = "export it again"
+
+
+@dataclass(frozen=True)
+class Record3DSequence(AbstractRecording):
+    """An archive `.r3d`: depth in m, packed by LZFSE, with its confidence, and JPEG colour of the same view."""
+
+    camera: Camera
+    """Of the depth images."""
+    times_s: tuple[float, ...]
+    """By frame number, from 0."""
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        return tuple(range(len(self.times_s)))
+
+    def frame(self, index: int) -> Frame:
+        """Return the frame with number `index`, without depth of confidence 0."""
+        if index not in self.indices:
+            raise self.absent(index)
+        size = self.camera.height, self.camera.width
+        depth = self._unpacked(f"rgbd/{index}.depth", size, "<f4")
+        depth_m = metres(depth.astype(np.float32), 1000.0)
+        if f"rgbd/{index}.conf" in self._names:
+            depth_m[self._unpacked(f"rgbd/{index}.conf", size, "u1") == 0] = np.nan
+        colour = None
+        if f"rgbd/{index}.jpg" in self._names:
+            where = f"{self.path}: rgbd/{index}.jpg"
+            seen = read_colour(EmbeddedImage(self._content(f"rgbd/{index}.jpg"), where))
+            colour = resize_to_depth(Path(where), seen, size)
+        return Frame(index, self.times_s[index], depth_m, self.camera, None, colour)
+
+    @property
+    def layout(self) -> str:
+        return "Record3D recording (R3D)"
+
+    @property
+    def depth_unit(self) -> str:
+        return "1000 mm (of the format)"
+
+    def _unpacked(self, name: str, size: tuple[int, int], kind: str) -> np.ndarray[Any, Any]:
+        try:
+            lzfse = importlib.import_module("lzfse")
+        except ImportError:
+            how = install_command("phones")
+            raise InputError(f"{self.path}: recordings of Record3D are unpacked by lzfse; {how}") from None
+        with input_errors(self.path, "recording", _EXPORT_AGAIN):
+            return np.frombuffer(lzfse.decompress(self._content(name)), kind).reshape(size).copy()
+
+    def _content(self, name: str) -> bytes:
+        with input_errors(self.path, "recording", _EXPORT_AGAIN):
+            if self._archive.getinfo(name).file_size > MAX_TEXT_BYTES:
+                raise ValueError(f"{name} is larger than images are")
+            return self._archive.read(name)
+
+    @cached_property
+    def _names(self) -> frozenset[str]:
+        return frozenset(self._archive.namelist())
+
+    @cached_property
+    def _archive(self) -> zipfile.ZipFile:
+        """Return the open archive; it is closed when this recording is forgotten."""
+        with input_errors(self.path, "recording", _EXPORT_AGAIN):
+            file = open_regular(self.path)
+            weakref.finalize(self, file.close)
+            return zipfile.ZipFile(file)
+
+
+def open_record3d(path: Path, overrides: Overrides) -> Record3DSequence:
+    """Open an archive of Record3D."""
+    with input_errors(path, "recording", _EXPORT_AGAIN), open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        if archive.getinfo("metadata").file_size > MAX_TEXT_BYTES:
+            raise ValueError("metadata is larger than it can be")
+        names, text = set(archive.namelist()), archive.read("metadata")
+    meta = Node(parse_json(text, path), path)
+    width, height = (int(meta.need(key).number(1.0, 1e5)) for key in ("dw", "dh"))
+    if width * height > MAX_PIXELS:
+        raise InputError(f"{path}: claims depth images of {width} x {height} pixels; export it again.")
+    facts = camera_of(meta, "metadata").scaled((width, height))
+    intrinsics = facts.intrinsics if overrides.intrinsics is None else overrides.intrinsics
+    count = next(index for index in range(len(names) + 1) if f"rgbd/{index}.depth" not in names)
+    if not count:
+        raise InputError(f"{path}: holds no image rgbd/0.depth; {_EXPORT_AGAIN}.")
+    stamps, rate = meta.get("frameTimestamps"), meta.get("fps")
+    times_s = [float(index) / (30.0 if rate is None else rate.number(1e-3, 1e4)) for index in range(count)]
+    if stamps is not None and len(stamps.elements()) == count:
+        times_s = [stamp.number() for stamp in stamps.elements()]
+    camera, said = Camera(width, height, *intrinsics), ("depth of confidence 0 is left out",)
+    calibrated = overrides.intrinsics is None
+    return Record3DSequence(path, camera, tuple(times_s), remarks=said, calibrated=calibrated, kind="tof")

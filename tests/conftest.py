@@ -28,7 +28,7 @@ from modeler.cli import main
 from modeler.sequences import bundled, write_bop
 from modeler.sequences.calibrated import flat_shares
 from modeler.sequences.colour_alignment import misalignment
-from modeler.system import concurrency
+from modeler.system import processes
 from modeler.types import Frame, Step
 from studies.formats.image_folders import WRITERS, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 
@@ -44,7 +44,7 @@ def rng():
 @pytest.fixture(autouse=True)
 def no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have reports written and live steps drawn every time, however slow disk and processor are."""
-    monkeypatch.setattr(concurrency, "_NO_TIME_S", np.inf)
+    monkeypatch.setattr(processes, "_NO_TIME_S", np.inf)
 
 
 _FOUND: dict[Any, Any] = {}

@@ -9,8 +9,8 @@ from slow_cases import quick_first
 
 from modeler.cli import main
 from modeler.sequences import bundled
-from modeler.system import concurrency
-from modeler.system.concurrency import in_background, in_parallel, parallel_map, prefetching
+from modeler.system import processes
+from modeler.system.processes import in_background, in_parallel, parallel_map, prefetching
 
 
 @pytest.fixture(params=[1, 2])
@@ -64,7 +64,7 @@ def test_an_item_that_may_be_dropped_is_not_waited_for(threads: int) -> None:
 
 def test_items_that_may_be_dropped_take_a_share_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
-    monkeypatch.setattr(concurrency, "_NO_TIME_S", 0.0)
+    monkeypatch.setattr(processes, "_NO_TIME_S", 0.0)
     now_s, used = 0.0, list[int]()
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
 

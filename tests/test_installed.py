@@ -29,7 +29,7 @@ for name in {LINUX_ONLY}:
     if hasattr(os, name):
         delattr(os, name)
 import modeler
-from modeler.system.concurrency import cores, is_parallel
+from modeler.system.processes import cores, is_parallel
 os.environ.pop("NUMBA_NUM_THREADS", None)
 assert cores() == os.cpu_count()
 assert is_parallel() == (cores() > 1)

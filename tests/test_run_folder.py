@@ -18,7 +18,7 @@ from run_builders import META, made_up_steps
 
 from modeler.export import RunFolder, RunMeta, report_of, write_atomically
 from modeler.export.reading import fault
-from modeler.system import concurrency
+from modeler.system import processes
 from modeler.types import InputError, Step
 from modeler.verdict import judged
 from studies.fuzz.special import replace_by
@@ -136,7 +136,7 @@ def test_run_has_finished_when_its_registrations_are_those_of_a_complete_run(tmp
 def test_a_folder_that_takes_long_to_write_is_written_less_often(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(concurrency, "_NO_TIME_S", 0.01)
+    monkeypatch.setattr(processes, "_NO_TIME_S", 0.01)
     now_s, written = 0.0, []
     run, steps = RunFolder.open(tmp_path), made_up_steps(40)
 
@@ -146,7 +146,7 @@ def test_a_folder_that_takes_long_to_write_is_written_less_often(
         written.append(step.frame.index)
         return report_of(step, meta)
 
-    monkeypatch.setattr("modeler.system.concurrency.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("modeler.system.processes.time.monotonic", lambda: now_s)
     monkeypatch.setattr("modeler.export.run_folder.report_of", slow)
     report = {}
     for step in steps:

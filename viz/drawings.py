@@ -63,6 +63,12 @@ def rotated(poses: Array, covariances: Array) -> Array:
     return rotations @ covariances @ np.swapaxes(rotations, 1, 2)
 
 
+def pyramid(corners: Array) -> Array:
+    """Return the edges of a pyramid from the origin to corners (4, 3) as one line (11, 3)."""
+    tip = np.zeros(3)
+    return np.array([tip, *corners, corners[0], tip, corners[1], corners[2], tip, corners[3]])
+
+
 @dataclass(frozen=True, eq=False)
 class Ellipsoids:
     """Ellipsoids of one standard deviation, magnified."""

@@ -14,7 +14,7 @@ from modeler.export.placing import upright
 from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Array, Camera, Edge, PoseGaussian, Step
 from modeler.viz import entities
-from modeler.viz.drawings import CLEAR, Drawing, Ellipsoids, caption, rotated, rounded_down, scale_words
+from modeler.viz.drawings import CLEAR, Drawing, Ellipsoids, caption, pyramid, rotated, rounded_down, scale_words
 from modeler.viz.readings import pose_table
 
 OVER_THE_RING: Final = np.array([-0.45, -0.8, -0.4])  # from the object towards the eye that looks at the whole graph
@@ -92,9 +92,7 @@ def _frusta(poses: Array, camera: Camera, size_m: float, style: tuple[entities.R
     """Return the cameras at `poses` (n, 4, 4) as pyramids `size_m` long, each one line strip."""
     across = (np.array([0, camera.width, camera.width, 0]) - camera.cx) / camera.fx
     down = (np.array([0, 0, camera.height, camera.height]) - camera.cy) / camera.fy
-    corners = size_m * np.stack([across, down, np.ones(4)], axis=1)
-    tip = np.zeros(3)
-    outline = np.array([tip, *corners, corners[0], tip, corners[1], corners[2], tip, corners[3]])
+    outline = pyramid(size_m * np.stack([across, down, np.ones(4)], axis=1))
     return _lines([se3.transform(pose, outline) for pose in poses], *style)
 
 

@@ -19,8 +19,7 @@ from threading import Lock
 from typing import Any, TypeVar
 
 from modeler.batch.jobs import PROCESSES, TRIES, Ended, Job, read_note, run, write_failure
-from modeler.system.concurrency import cores
-from modeler.system.processes import environment, install_command
+from modeler.system.processes import cores, environment, install_command
 from modeler.types import InputError
 
 T = TypeVar("T")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from modeler.cli.console import Console, Interrupt, as_options, say, trusted_status
-from modeler.cli.options import MIN_VOXEL_M, FrameOptions, InputOptions, ModelOptions, given_options
+from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, check_voxel, given_options
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
 
@@ -74,7 +74,7 @@ class Build:
         from modeler.runs.outputs import check_run_folder, run_inputs
         from modeler.segmentation import scene_frames
         from modeler.sequences import read_focal_factor
-        from modeler.system.concurrency import in_parallel
+        from modeler.system.processes import in_parallel
         from modeler.viz.stream import load
 
         began_s = time.perf_counter()
@@ -192,9 +192,7 @@ def _check(options: Build) -> None:
         unused += given_options(options.prior, method, model)
         if unused:
             raise InputError(f"--model places frames on a finished model; leave out {', '.join(unused)}")
-    voxel_m = options.model.voxel_m
-    if voxel_m is not None and not MIN_VOXEL_M <= voxel_m < 1.0:
-        raise InputError(f"--voxel-m {voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
+    check_voxel(options.model.voxel_m)
     tolerance_mm = options.model.tolerance_mm
     if tolerance_mm is not None and not 0.0 < tolerance_mm < math.inf:
         raise InputError(f"--tolerance-mm {tolerance_mm:g} is out of range; give a positive length in mm")
@@ -204,25 +202,17 @@ def _check(options: Build) -> None:
 
 def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence, Mapping[int, str]]:
     """Return the sequence, the selected frames and their digests; what is unreadable is found before all else."""
-    from modeler.cli.reading import opened
+    from modeler.cli.reading import opened, selected
     from modeler.runs.reopening import calibrated
-    from modeler.sequences import frame_range, survey
     from modeler.types import InputError
 
     path = options.sequence
     whole = opened(path, options.given, options.idle_s if options.watch else None)
     whole = calibrated(whole, options.model.sensor, options.model.camera)
-    frames = whole.select(every=options.selection.every, frames=frame_range(options.selection.frames))
-    digests: Mapping[int, str] = {}
-    if not frames.live:
-        found = survey(frames, truth=False)
-        found.check(frames.name, despite_doubts=options.given.despite_doubts)
-        if options.method.method == "coloured-icp" and found.colours == 0:
-            raise InputError(f"{path}: has no colour, which coloured ICP compares; give another --method")
-        for doubt in found.doubts:
-            say(doubt)
-        digests = found.digests
-    return whole, frames, digests
+    frames, found = selected(whole, options.selection, options.given)
+    if found is not None and options.method.method == "coloured-icp" and found.colours == 0:
+        raise InputError(f"{path}: has no colour, which coloured ICP compares; give another --method")
+    return whole, frames, {} if found is None else found.digests
 
 
 def _run(
@@ -238,7 +228,7 @@ def _run(
     from modeler.cli.reading import while_it_lasts
     from modeler.composition.compose import comes_back
     from modeler.runs.live_advice import advising
-    from modeler.system.concurrency import in_background
+    from modeler.system.processes import in_background
     from modeler.types import Step
     from modeler.viz.stream import open_stream
 

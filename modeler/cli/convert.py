@@ -94,13 +94,14 @@ def _poses(run: Path, out: Path) -> int:
     from modeler import se3
     from modeler.export import RunFolder, poses_of, tum_text, write_atomically
     from modeler.sequences.bop import pose_entry
+    from modeler.system.regular_files import json_lines
     from modeler.types import InputError
 
     report = RunFolder(run).result()
     poses = {frame: pose.mean for frame, pose in poses_of(report).items()}
     if out.suffix == ".json":
-        lines = (f' "{index}": {json.dumps([pose_entry(se3.inverse(pose))])}' for index, pose in poses.items())
-        write_atomically(out, "{\n" + ",\n".join(lines) + "\n}\n")
+        entries = {str(index): [pose_entry(se3.inverse(pose))] for index, pose in poses.items()}
+        write_atomically(out, json_lines(entries))
     elif out.suffix == ".txt":
         write_atomically(out, tum_text(poses, {frame["id"]: frame["timestamp"] for frame in report["frames"]}))
     else:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from modeler.cli.console import say
-from modeler.cli.options import MIN_VOXEL_M, MovedOptions
+from modeler.cli.options import MovedOptions, check_voxel
 from modeler.composition.options import default
 
 Origin = Literal["camera", "base", "centre", "bbox"]  # spelt out here, for help imports nothing heavy
@@ -203,8 +203,7 @@ def _check_numbers(options: Export) -> None:
         raise InputError(f"--triangles {options.triangles} is too few for a solid; give at least 4")
     if not 64 <= options.texture_px <= 8192:
         raise InputError(f"--texture-px {options.texture_px} is out of range; give 64 to 8192")
-    if options.voxel_m is not None and not MIN_VOXEL_M <= options.voxel_m < 1.0:
-        raise InputError(f"--voxel-m {options.voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
+    check_voxel(options.voxel_m)
     for name, value in (("density-kg-m3", options.density_kg_m3), ("mass-kg", options.mass_kg)):
         if value is not None and not 0.0 < value < 1e6:
             raise InputError(f"--{name} {value:g} is out of range; give a positive number")

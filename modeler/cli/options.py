@@ -17,6 +17,14 @@ if TYPE_CHECKING:
 MIN_VOXEL_M = 1e-5  # no camera resolves less; a model of such voxels fits into no memory
 
 
+def check_voxel(voxel_m: float | None) -> None:
+    """Refuse a side of voxels that is out of range."""
+    from modeler.types import InputError
+
+    if voxel_m is not None and not MIN_VOXEL_M <= voxel_m < 1.0:
+        raise InputError(f"--voxel-m {voxel_m:g} is out of range; give a length in m from {MIN_VOXEL_M:g} to 1")
+
+
 @dataclass(frozen=True)
 class MovedOptions:
     """Where the sequence is now, if it has moved since the run was made."""

@@ -9,8 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modeler.cli.console import bar, say
-from modeler.cli.options import InputOptions
-from modeler.sequences import AbstractSequence, KeptSequence, WatchLimits, open_sequence, watch
+from modeler.cli.options import FrameOptions, InputOptions
+from modeler.sequences import (
+    AbstractSequence,
+    KeptSequence,
+    Survey,
+    WatchLimits,
+    frame_range,
+    open_sequence,
+    survey,
+    watch,
+)
 from modeler.sequences.base import AbstractDerived
 from modeler.types import Frame, InputError
 
@@ -68,3 +77,17 @@ def opened(path: Path, given: InputOptions, idle_s: float | None) -> AbstractSeq
         raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
     say(f"waiting for frames in {path}")
     return watch(path, given.overrides(), WatchLimits(idle_s))
+
+
+def selected(
+    whole: AbstractSequence, selection: FrameOptions, given: InputOptions
+) -> tuple[AbstractSequence, Survey | None]:
+    """Return the selected frames, and what is found in them if they are not live: doubts are said, errors refused."""
+    frames = whole.select(every=selection.every, frames=frame_range(selection.frames))
+    if frames.live:
+        return frames, None
+    found = survey(frames, truth=False)
+    found.check(frames.name, despite_doubts=given.despite_doubts)
+    for doubt in found.doubts:
+        say(doubt)
+    return frames, found

@@ -83,20 +83,13 @@ class Track:
 
     def _opened(self, thing: KnownObject) -> tuple[AbstractSequence, AbstractSequence]:
         """Return the sequence, and the selected frames; those that are plainly not what they seem are refused."""
-        from modeler.cli.reading import opened
+        from modeler.cli.reading import opened, selected
         from modeler.runs.reopening import calibrated
-        from modeler.sequences import frame_range, survey
 
         whole = opened(self.sequence, self.given, self.idle_s if self.watch else None)
         whole = calibrated(whole, self.sensor, self.camera)
         whole = whole if self.camera is not None else thing.seen_by(whole)
-        frames = whole.select(every=self.selection.every, frames=frame_range(self.selection.frames))
-        if not frames.live:
-            found = survey(frames, truth=False)
-            found.check(frames.name, despite_doubts=self.given.despite_doubts)
-            for doubt in found.doubts:
-                say(doubt)
-        return whole, frames
+        return whole, selected(whole, self.selection, self.given)[0]
 
     def _tracker(self, thing: KnownObject, sequence: AbstractSequence) -> Tracker:
         """Return the tracker with the parts asked for."""

@@ -26,7 +26,7 @@ from modeler import se3
 from modeler.export.files import ply_bytes, write_atomically
 from modeler.export.placing import Placement
 from modeler.system.pictures import encoded, raycaster, tensor
-from modeler.system.regular_files import read_json
+from modeler.system.regular_files import json_lines, read_json
 from modeler.types import Array, BoolArray, Camera, Frame, InputError, ObjectModel
 
 MODELS_INFO = "models_info.json"  # BOP's list of models, in their folder
@@ -153,7 +153,7 @@ def scene_gt_info(model: ObjectModel, frames: Iterable[Frame], camera_from_model
                 "visib_fract": min(1.0, seen / whole) if whole else 0.0,
             }
         ]
-    return "{\n" + ",\n".join(f' "{index}": {json.dumps(entry)}' for index, entry in entries.items()) + "\n}\n"
+    return json_lines(entries)
 
 
 def _box(mask: BoolArray) -> list[int]:

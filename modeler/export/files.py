@@ -183,26 +183,18 @@ def ply_bytes(
         views: (n,) number of views that saw each point, stored as `views`; 0 = interpolated.
         sigmas_m: (n,) standard deviation along the normal, stored as `sigma_m`; inf, stored as -1, where there is none.
     """
-    names = ["x", "y", "z", "nx", "ny", "nz"]
-    fields = [(name, "<f4") for name in names]
-    header = [f"property float {name}" for name in names]
-    values = list(np.concatenate([points_m, normals], axis=1).T)
+    places = np.hstack([points_m, normals]).astype("<f4").T
+    columns: dict[str, np.ndarray] = dict(zip(("x", "y", "z", "nx", "ny", "nz"), places, strict=True))
     if colours is not None:
-        names = ["red", "green", "blue"]
-        fields += [(name, "u1") for name in names]
-        header += [f"property uchar {name}" for name in names]
-        values += list(colours.T)
+        columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
     if views is not None:
-        fields.append(("views", "<u2"))
-        header.append("property ushort views")
-        values.append(np.minimum(views, np.iinfo(np.uint16).max))
+        columns["views"] = np.minimum(views, np.iinfo(np.uint16).max).astype("<u2")
     if sigmas_m is not None:
-        fields.append(("sigma_m", "<f4"))
-        header.append("property float sigma_m")
-        values.append(np.where(np.isfinite(sigmas_m), sigmas_m, -1.0))  # readers of PLY stumble over inf
-    vertices = np.empty(len(points_m), dtype=fields)
-    for (name, _), column in zip(fields, values, strict=True):
-        vertices[name] = column
+        columns["sigma_m"] = np.where(np.isfinite(sigmas_m), sigmas_m, -1.0).astype("<f4")  # readers stumble over inf
+    fields = [(name, column.dtype) for name, column in columns.items()]
+    vertices = np.rec.fromarrays(list(columns.values()), dtype=fields)
+    kinds = {"f4": "float", "u1": "uchar", "u2": "ushort"}
+    header = [f"property {kinds[kind.str[1:]]} {name}" for name, kind in fields]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *header]
     body = vertices.tobytes()
     if triangles is not None:

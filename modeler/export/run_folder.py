@@ -19,7 +19,7 @@ from modeler.export.files import PART, cloud_ply, g2o_text, mesh_ply, settle, se
 from modeler.export.pairs import Pairs
 from modeler.export.reading import fault
 from modeler.export.report import RunMeta, report_of
-from modeler.system.concurrency import Pace
+from modeler.system.processes import Pace
 from modeler.system.regular_files import check_regular, read_json
 from modeler.types import BoolArray, InputError, Step
 

@@ -27,7 +27,7 @@ from modeler.fusion.depth_views import (
 from modeler.fusion.meshing import DistanceField, VoxelGrid, filled, grid_around, measured
 from modeler.fusion.support import Exposure, ViewSupport, exposure_of, view_support
 from modeler.kernels import point_clouds
-from modeler.system.concurrency import in_parallel
+from modeler.system.processes import in_parallel
 from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
 
 # Exponents of the view weights for colours: an average of views for vertices, nearly one view for textures, where an

@@ -34,7 +34,7 @@ from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import Placed, State
 from modeler.segmentation import Scene
 from modeler.significance import QUORUM
-from modeler.system.concurrency import prefetching
+from modeler.system.processes import prefetching
 from modeler.types import (
     NEAR_DEG,
     BoolArray,

@@ -12,8 +12,8 @@ from modeler.pipeline.attempts import Attempt, Search, Stage
 from modeler.pipeline.pairs import Registrations
 from modeler.pipeline.state import State, newest_ready
 from modeler.registration.posterior import failed
-from modeler.system.concurrency import parallel_map
 from modeler.system.disk_arrays import release
+from modeler.system.processes import parallel_map
 from modeler.types import (
     FULL_EFFORT,
     AbstractPrior,

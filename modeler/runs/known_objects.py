@@ -19,7 +19,7 @@ from modeler.fusion.symmetries import Axis, Symmetries
 from modeler.sequences import AbstractSequence, FocalFactor, RefocusedSequence
 from modeler.sequences.calibrated import has_focal
 from modeler.sequences.meshes import opened_mesh
-from modeler.system.concurrency import Pace
+from modeler.system.processes import Pace
 from modeler.system.regular_files import left_behind, read_json
 from modeler.tracking import Tracked
 from modeler.tracking.tracker import UNITS_M

@@ -22,7 +22,7 @@ from urllib.request import urlopen
 
 import nicegui
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, HTTPException
 from fastapi.responses import FileResponse, Response
 from nicegui import ui
 
@@ -288,47 +288,43 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
 
     @app.get("/frames/{name}/{frame}.jpg")
     def of_frame(name: str, frame: int) -> Response:
-        scan = studio.known(name)
-        if scan is None or frame not in scan.sequence.indices:
-            return Response(status_code=404)
-        return _picture(jpeg(scan.sequence.frame(frame)))
+        return _picture(jpeg(_scan(studio, name, frame).sequence.frame(frame)))
 
     @app.get("/thumbnails/{name}/{frame}.jpg")
     def of_mask(name: str, frame: int) -> Response:
-        scan = studio.known(name)
-        if scan is None or frame not in scan.sequence.indices:
-            return Response(status_code=404)
+        scan = _scan(studio, name, frame)
         return _picture(thumbnail(scan.sequence.frame(frame), scan.mask(frame)))
 
     @app.get("/capture/newest.jpg")
     def newest() -> Response:
         source = studio.recorder or studio.capture
         frame = None if source is None else source.frame
-        return Response(status_code=404) if frame is None else _picture(jpeg(frame))
+        if frame is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND)
+        return _picture(jpeg(frame))
 
     @app.get("/models/{name}/{run}.jpg")
     def of_model(name: str, run: str) -> Response:
         folder = _run(studio, name, run)
-        if folder is None:
-            return Response(status_code=404)
         drawn = folder.with_name(f"{run}.jpg")
         with contextlib.suppress(InputError, OSError):
             thumbnail_of(folder, drawn)
             return _picture(read_regular(drawn))
-        return Response(status_code=404)
+        raise HTTPException(HTTPStatus.NOT_FOUND)
 
     @app.get("/runs/{name}/{run}/{file}")
     def of_run(name: str, run: str, file: str) -> Response:
-        folder = _run(studio, name, run)
-        if folder is None or file not in _OF_RUN:
-            return Response(status_code=404)
-        return _file(folder / file)
+        if file not in _OF_RUN:
+            raise HTTPException(HTTPStatus.NOT_FOUND)
+        return _file(_run(studio, name, run) / file)
 
     @app.get("/viewer/{name}")
     @app.get("/viewer/")
     def of_viewer(name: str = "") -> Response:
         found = viewers.file(name) if re.compile(r"[\w.-]{0,64}").fullmatch(name) else None
-        return Response(status_code=404) if found is None else Response(found[0], media_type=found[1])
+        if found is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND)
+        return Response(found[0], media_type=found[1])
 
     @app.get("/take-away/{name}/{file}")
     def taken(name: str, file: str) -> Response:
@@ -338,7 +334,7 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
             return _file(entries[file], download=file)
         whole = entries.get(file.removesuffix(".zip"))
         if whole is None or not whole.is_dir():
-            return Response(status_code=404)
+            raise HTTPException(HTTPStatus.NOT_FOUND)
         with tempfile.TemporaryDirectory() as place:
             packed = shutil.make_archive(str(Path(place) / "packed"), "zip", whole.parent, whole.name)
             headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(file)}"}
@@ -352,19 +348,28 @@ def _application(studio: Studio, viewers: Viewers) -> FastAPI:
     return app
 
 
-def _run(studio: Studio, name: str, run: str) -> Path | None:
-    """Return a run folder by its names; None if there is none."""
+def _scan(studio: Studio, name: str, frame: int) -> Scan:
+    """Return the scan of a name that has a frame."""
+    scan = studio.known(name)
+    if scan is None or frame not in scan.sequence.indices:
+        raise HTTPException(HTTPStatus.NOT_FOUND)
+    return scan
+
+
+def _run(studio: Studio, name: str, run: str) -> Path:
+    """Return a run folder by its names."""
     folder = next((folder for folder in studio.folders() if folder.name == name), None)
     runs = {} if folder is None else {path.name: path for path in folder.glob("run-*")}
-    found = runs.get(run)
-    return found if found is not None and RunFolder(found).is_run else None
+    if run not in runs or not RunFolder(runs[run]).is_run:
+        raise HTTPException(HTTPStatus.NOT_FOUND)
+    return runs[run]
 
 
 def _file(path: Path, download: str | None = None) -> Response:
     try:
         check_regular(path)
     except InputError:
-        return Response(status_code=404)
+        raise HTTPException(HTTPStatus.NOT_FOUND) from None
     return FileResponse(path, headers={"cache-control": "no-store"}, filename=download)
 
 

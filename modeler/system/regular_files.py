@@ -10,7 +10,7 @@ import glob
 import json
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -112,6 +112,12 @@ def read_json(path: Path, most_bytes: int = MAX_BYTES) -> Any:
         InputError: if it is no regular file, too large, missing, cannot be read, or is not valid JSON.
     """
     return parse_json(read_regular(path, most_bytes), path)
+
+
+def json_lines(content: Mapping[str, object]) -> str:
+    """Return an object as JSON with an entry a line, which keeps files both small and readable."""
+    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
+    return f"{{\n{lines}\n}}\n"
 
 
 def parse_json(content: str | bytes, path: Path) -> Any:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -66,8 +65,6 @@ class Places:
 class Cylindrical:
     """One image around the z axis, over side-facing surface."""
 
-    count: ClassVar[int] = 1
-    """Number of charts."""
     bottom_m: float | None = None
     """Height in the model frame at which it begins in m; null for that of the lowest point."""
     top_m: float | None = None
@@ -100,9 +97,6 @@ class Cylindrical:
 @dataclass(frozen=True)
 class Spherical:
     """One image around the middle of the body: columns are meridians, rows circles of latitude."""
-
-    count: ClassVar[int] = 1
-    """Number of charts."""
 
     def charts(self, mesh: Mesh) -> tuple[Chart, ...]:
         """Return the charts of a mesh."""
@@ -149,9 +143,6 @@ class Faces:
 @dataclass(frozen=True)
 class Unwrapped:
     """One image mapped by the texture coordinates of the mesh file."""
-
-    count: ClassVar[int] = 1
-    """Number of charts."""
 
     def charts(self, mesh: Mesh) -> tuple[Chart, ...]:
         """Return the charts of a mesh."""
@@ -329,8 +320,9 @@ class Label:
     """How it is laid around the object."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.image, Picture) and len(self.image.paths) not in (1, self.wrap.count):
-            raise ValueError(f"paths must hold one image or {self.wrap.count}")
+        charts = self.wrap.count if isinstance(self.wrap, Faces) else 1
+        if isinstance(self.image, Picture) and len(self.image.paths) not in (1, charts):
+            raise ValueError(f"paths must hold one image or {charts}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -183,7 +183,6 @@ def _rows(message: Any, bytes_a_pixel: int, where: str) -> npt.NDArray[np.uint8]
     return np.ascontiguousarray(rows[:, :needed])
 
 
-FARTHEST_M = 1e4  # no robot is larger
 MOST = 1000  # messages of fixed transforms that are read; drivers send one or a few
 
 
@@ -217,10 +216,10 @@ def transform_pose(transform: Any) -> Array | None:
     turn, shift = transform.rotation, transform.translation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
     offset_m = np.array([shift.x, shift.y, shift.z], dtype=np.float64)
-    small = bool((np.abs(quaternion) < 2.0).all() and (np.abs(offset_m) < FARTHEST_M).all())  # not so of NaN
-    if not small or not 0.9 < float(np.linalg.norm(quaternion)) < 1.1:
+    if not 0.9 < float(np.linalg.norm(quaternion)) < 1.1:  # not so of NaN
         return None
-    return se3.rigid(Rotation.from_quat(quaternion).as_matrix(), offset_m)
+    motion = se3.rigid(Rotation.from_quat(quaternion).as_matrix(), offset_m)
+    return motion if se3.is_rigid(motion, tolerance=1e-3) else None
 
 
 def _name(frame_id: str) -> str:

@@ -26,7 +26,7 @@ from modeler.evaluation import rotation_error_deg, true_motion
 from modeler.export import RunFolder, RunMeta
 from modeler.pipeline import NewestFrames
 from modeler.sequences.rendering.recipe import Hand
-from modeler.system.concurrency import in_background
+from modeler.system.processes import in_background
 from modeler.types import Frame, Step
 from modeler.viz.stream import open_stream
 from studies.in_hand.study import stage

@@ -21,7 +21,7 @@ from modeler.export.placing import model_up, model_upright
 from modeler.fusion import Symmetries, SymmetryFinder
 from modeler.types import ACCEPTED, Array, InputError, Outcome, loops_closed
 from modeler.verdict.advice import contradicted_focal_length
-from modeler.viz.drawings import VIEW_POINTS
+from modeler.viz.drawings import VIEW_POINTS, pyramid
 from modeler.viz.report import plots
 from modeler.viz.report.cards import data_address, mask_cards, pair_cards, thumbnails
 from modeler.viz.report.mesh import Mesh, portrait, read_mesh, scene
@@ -278,9 +278,7 @@ def _pyramid(object_from_camera: Array) -> Array:
     """Return a camera (n, 3) as one line in the object frame, as long as 12 % of its distance."""
     size_m = 0.12 * max(float(np.linalg.norm(object_from_camera[:3, 3])), 0.3)
     corners = size_m * np.array([[-0.55, -0.4, 1.0], [0.55, -0.4, 1.0], [0.55, 0.4, 1.0], [-0.55, 0.4, 1.0]])
-    tip = np.zeros(3)
-    outline = [tip, *corners, corners[0], tip, corners[1], corners[2], tip, corners[3]]
-    return se3.transform(object_from_camera, np.array(outline))
+    return se3.transform(object_from_camera, pyramid(corners))
 
 
 def _scale() -> str:
