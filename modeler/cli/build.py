@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from modeler.cli.console import Console, Interrupt, as_options, say, trusted_status
-from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, check_voxel, given_options
+from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, WatchOptions, check_voxel, given_options
 from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
 
@@ -50,16 +50,9 @@ class Build:
     resume: bool = False
     """Continue a run that was interrupted, or whose frames have changed, with the same options: only pairs that are
     new are registered."""
-    watch: bool = False
-    """Process frames while another program is still writing into SEQUENCE."""
-    idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
-    """With --watch: end the sequence after so long without a new frame (or at a file `done`, or at Ctrl-C)."""
-    view: bool = False
-    """Watch in the Rerun viewer."""
-    web: bool = False
-    """Watch in the browser, served on 127.0.0.1 only."""
     connect: Annotated[str | None, tyro.conf.arg(metavar="URL"), default("none")] = None
     """Watch in a Rerun viewer that is already open: rerun+http://HOST:PORT/proxy."""
+    watching: WatchOptions = field(default_factory=WatchOptions)
     model: ModelOptions = field(default_factory=ModelOptions)
     prior: PriorOptions = field(default_factory=PriorOptions)
     method: MethodOptions = field(default_factory=MethodOptions)
@@ -188,8 +181,8 @@ def _check(options: Build) -> None:
             replace(options.method, seed=MethodOptions.seed),
             replace(options.model, sensor=None, camera=None),
         )
-        unused = [f"--{name}" for name in ("resume", "watch", "view", "web", "connect") if getattr(options, name)]
-        unused += given_options(options.prior, method, model)
+        unused = [f"--{name}" for name in ("resume", "connect") if getattr(options, name)]
+        unused += given_options(replace(options.watching, idle_s=WatchOptions.idle_s), options.prior, method, model)
         if unused:
             raise InputError(f"--model places frames on a finished model; leave out {', '.join(unused)}")
     check_voxel(options.model.voxel_m)
@@ -207,7 +200,7 @@ def _opened(options: Build) -> tuple[AbstractSequence, AbstractSequence, Mapping
     from modeler.types import InputError
 
     path = options.sequence
-    whole = opened(path, options.given, options.idle_s if options.watch else None)
+    whole = opened(path, options.given, options.watching)
     whole = calibrated(whole, options.model.sensor, options.model.camera)
     frames, found = selected(whole, options.selection, options.given)
     if found is not None and options.method.method == "coloured-icp" and found.colours == 0:
@@ -236,8 +229,8 @@ def _run(
     stream = open_stream(
         frames.name,
         save=folder.path / "recording.rrd",
-        spawn=options.view,
-        web=options.web,
+        spawn=options.watching.view,
+        web=options.watching.web,
         connect=options.connect,
         facts={"sequence": meta.sequence, "seed": meta.seed, "prior": meta.prior, **meta.settings},
         advised=frames.live,

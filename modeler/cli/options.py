@@ -71,6 +71,20 @@ class FrameOptions:
     """Use frame numbers from A up to, but not including, B; either may be left out."""
 
 
+@dataclass(frozen=True)
+class WatchOptions:
+    """A sequence that is still being written, and a viewer."""
+
+    watch: bool = False
+    """Process frames while another program is still writing into SEQUENCE."""
+    idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
+    """With --watch: end the sequence after so long without a new frame (or at a file `done`, or at Ctrl-C)."""
+    view: bool = False
+    """Watch in the Rerun viewer."""
+    web: bool = False
+    """Watch in the browser, served on 127.0.0.1 only."""
+
+
 def given_options(*groups: object) -> dict[str, tuple[object, ...]]:
     """Return the options of groups that have other values than their defaults, each with its values."""
     found: dict[str, tuple[object, ...]] = {}

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modeler.cli.console import bar, say
-from modeler.cli.options import FrameOptions, InputOptions
+from modeler.cli.options import FrameOptions, InputOptions, WatchOptions
 from modeler.sequences import (
     AbstractSequence,
     KeptSequence,
@@ -62,21 +62,15 @@ def reading() -> Iterator[Callable[..., AbstractSequence]]:
         yield watched
 
 
-def opened(path: Path, given: InputOptions, idle_s: float | None) -> AbstractSequence:
-    """Return a sequence, its first frames kept in memory; one that another program is writing, once it has begun.
-
-    Args:
-        path: of the sequence.
-        given: values that take precedence over its files.
-        idle_s: while it is written, it is over after this many seconds without a new frame; None: it is not.
-    """
-    if idle_s is None:
+def opened(path: Path, given: InputOptions, watching: WatchOptions) -> AbstractSequence:
+    """Return a sequence, its first frames kept in memory; one that another program is writing, once it has begun."""
+    if not watching.watch:
         whole = open_sequence(path, given.overrides())
         return whole if whole.live else KeptSequence(whole)
-    if not 0.0 < idle_s < math.inf:
-        raise InputError(f"--idle-s {idle_s:g} is out of range; give a positive number of seconds")
+    if not 0.0 < watching.idle_s < math.inf:
+        raise InputError(f"--idle-s {watching.idle_s:g} is out of range; give a positive number of seconds")
     say(f"waiting for frames in {path}")
-    return watch(path, given.overrides(), WatchLimits(idle_s))
+    return watch(path, given.overrides(), WatchLimits(watching.idle_s))
 
 
 def selected(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from modeler.cli.console import Interrupt, say
-from modeler.cli.options import FrameOptions, InputOptions
+from modeler.cli.options import FrameOptions, InputOptions, WatchOptions
 from modeler.composition.options import SEED, MethodOptions, ObjectOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
 
@@ -42,14 +42,6 @@ class Track:
     """Look for the object in each frame for itself, with any rotation."""
     overwrite: bool = False
     """Replace the results of an earlier track in the folder."""
-    watch: bool = False
-    """Process frames while another program is still writing into SEQUENCE."""
-    idle_s: Annotated[float, tyro.conf.arg(metavar="S")] = 10.0
-    """With --watch: end the sequence after so long without a new frame."""
-    view: bool = False
-    """Watch in the Rerun viewer."""
-    web: bool = False
-    """Watch in the browser, served on 127.0.0.1 only."""
     sensor: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("from SEQUENCE")] = None
     """Noise of the depth camera, as `modeler calibrate-sensor` measured it."""
     camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("from the run, if of the same camera")] = None
@@ -58,6 +50,7 @@ class Track:
     """Do not compare colours."""
     seed: Annotated[int, SEED] = 0
     """Same seed, same machine, same result, to the bit."""
+    watching: WatchOptions = field(default_factory=WatchOptions)
     prior: PriorOptions = field(default_factory=PriorOptions)
     selection: FrameOptions = field(default_factory=FrameOptions)
     where: ObjectOptions = field(default_factory=ObjectOptions)
@@ -86,7 +79,7 @@ class Track:
         from modeler.cli.reading import opened, selected
         from modeler.runs.reopening import calibrated
 
-        whole = opened(self.sequence, self.given, self.idle_s if self.watch else None)
+        whole = opened(self.sequence, self.given, self.watching)
         whole = calibrated(whole, self.sensor, self.camera)
         whole = whole if self.camera is not None else thing.seen_by(whole)
         return whole, selected(whole, self.selection, self.given)[0]
@@ -124,7 +117,7 @@ class Track:
 
         facts = {"model": folder.model, "sequence": folder.sequence, "seed": self.seed}
         recording = folder.path / "recording.rrd"
-        stream = open_stream(frames.name, save=recording, spawn=self.view, web=self.web, facts=facts)
+        stream = open_stream(frames.name, save=recording, spawn=self.watching.view, web=self.watching.web, facts=facts)
         found: list[Tracked] = []
         try:
             stream.lay_out(blueprint.tracking_layout(None))

@@ -252,21 +252,19 @@ def simplified(model: ObjectModel, triangles: int | None = None) -> ObjectModel:
     if not len(fewer.triangles):
         raise InputError(f"{triangles} triangles are too few for this mesh; allow more")
     _, nearest = KDTree(model.vertices_m).query(vertices_m)
-    like = _with_vertices(model, np.asarray(nearest), np.asarray(fewer.triangles, dtype=np.int64))
-    return replace(like, vertices_m=vertices_m, vertex_normals=np.asarray(fewer.vertex_normals))
-
-
-def _with_vertices(model: ObjectModel, numbers: npt.NDArray[np.int64], triangles: npt.NDArray[np.int64]) -> ObjectModel:
-    """Return a model with these of its vertices (v,), which may occur again, and triangles (t, 3) of them."""
     return replace(
         model,
-        vertices_m=model.vertices_m[numbers],
-        triangles=triangles,
-        vertex_normals=model.vertex_normals[numbers],
-        vertex_colours=None if model.vertex_colours is None else model.vertex_colours[numbers],
-        vertex_views=None if model.vertex_views is None else model.vertex_views[numbers],
-        vertex_sigmas_m=None if model.vertex_sigmas_m is None else model.vertex_sigmas_m[numbers],
+        vertices_m=vertices_m,
+        triangles=np.asarray(fewer.triangles, dtype=np.int64),
+        vertex_normals=np.asarray(fewer.vertex_normals),
+        **_of_vertices(model, np.asarray(nearest)),
     )
+
+
+def _of_vertices(model: ObjectModel, numbers: npt.NDArray[np.integer]) -> dict[str, np.ndarray | None]:
+    """Return colours, views and deviations of some vertices (n,) as fields of a model."""
+    known = {name: getattr(model, name) for name in ("vertex_colours", "vertex_views", "vertex_sigmas_m")}
+    return {name: None if values is None else values[numbers] for name, values in known.items()}
 
 
 def _largest_error(model: ObjectModel) -> float:
@@ -360,7 +358,13 @@ def textured(model: ObjectModel, paint: Paint, side_px: int) -> tuple[ObjectMode
     starts = np.cumsum([0, *(len(part[0]) for part in parts)])
     triangles = np.concatenate([part[1] + start for part, start in zip(parts, starts, strict=False)])
     places = np.concatenate([part[2] for part in parts])
-    wrapped = _with_vertices(model, origin, triangles.astype(np.int64))
+    wrapped = replace(
+        model,
+        vertices_m=model.vertices_m[origin],
+        triangles=triangles.astype(np.int64),
+        vertex_normals=model.vertex_normals[origin],
+        **_of_vertices(model, origin),
+    )
     packed = max(atlas.width, atlas.height)
     shares = places.astype(np.float64) * np.array([atlas.width, atlas.height]) / packed
     image, seen = _baked(wrapped, shares * side_px, side_px, paint)
