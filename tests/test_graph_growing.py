@@ -161,3 +161,81 @@ def test_a_solution_keeps_none_of_those_before_it() -> None:
     assert kept[-1]() is growing.solution.relative_covariance
     gc.collect()
     assert [covariance() for covariance in kept[:-1]] == [None] * (len(kept) - 1)
+
+
+@pytest.fixture
+def condensing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Graphs of 24 frames and more are condensed, every 12 frames."""
+    monkeypatch.setattr(optimise, "CONDENSED_FROM", 2 * PER_TURN)
+    monkeypatch.setattr(optimise, "_RENEWED_AT", (PER_TURN, COUNT))
+
+
+def _turns(count: int, rng: np.random.Generator, *, false: float = 0.0) -> list[list[Edge]]:
+    """The edges that each frame of many turns brings: to the last view, and of every third to views of the first turn.
+
+    The first false loop comes after five right ones.
+    """
+    truth = turntable(count, PER_TURN)
+    arrivals = []
+    for k in range(1, count):
+        edges = [edge(k - 1, k, measured(truth, k - 1, k, rng))]
+        if k >= PER_TURN and k % 3 == 0:
+            near = k % PER_TURN, (k + 3) % PER_TURN
+            edges += [edge(t, k, measured(truth, t, k, rng), "closure") for t in near]
+            wrong = len(arrivals) > 2 * PER_TURN and rng.random() < false
+            edges[-1] = _spoilt(edges[-1], rng) if wrong else edges[-1]
+        arrivals.append(edges)
+    return arrivals
+
+
+def _assert_near(one: Solution, other: Solution, frames: Sequence[int]) -> None:
+    """Poses of frames are the same to half a tenth of their standard deviations, covariances to two hundredths."""
+    for frame in frames:
+        whiten = np.linalg.inv(np.linalg.cholesky(other.covariances[frame]))
+        assert np.linalg.norm(whiten @ se3.log(se3.inverse(other.trajectory[frame]) @ one.trajectory[frame])) < 0.05
+        np.testing.assert_allclose(whiten @ one.covariances[frame] @ whiten.T, np.eye(6), atol=2e-2)
+    assert set(one.outliers) == set(other.outliers)
+
+
+@pytest.mark.usefixtures("condensing")
+@pytest.mark.parametrize("false", [0.0, 0.3])
+def test_a_condensed_graph_places_new_frames_as_the_batch_does(false: float) -> None:
+    growing, sizes = Smoother(), []
+    for number, edges in enumerate(_turns(7 * PER_TURN, np.random.default_rng(21), false=false), 1):
+        growing = growing.plus(edges)
+        solver = growing.state.solver
+        sizes.append(0 if solver is None else solver.values.size())
+        if number > 2 * PER_TURN and number % 11 == 0:
+            batch = solve(growing.graph, {})
+            _assert_near(growing.solution, batch, [3, 6, 9, number])
+            for frame in (4, number - 15):  # eliminated
+                found, wanted = (s.relative_covariance(number, frame) for s in (growing.solution, batch))
+                np.testing.assert_allclose(found, wanted, rtol=2e-2, atol=2e-2 * np.abs(wanted).max())
+    assert max(sizes[: 2 * PER_TURN]) >= 2 * PER_TURN - 3
+    assert max(sizes[3 * PER_TURN :]) < 2 * PER_TURN + 6  # it does not grow
+
+
+@pytest.mark.usefixtures("condensing")
+def test_solved_again_a_condensed_graph_has_the_solution_of_the_batch() -> None:
+    growing = Smoother()
+    for edges in _turns(5 * PER_TURN - 4, np.random.default_rng(22)):
+        growing = growing.plus(edges)
+    assert growing.state.solver is not None
+    assert growing.state.solver.condensed is not None
+    _assert_same(growing.to(growing.graph).solution, solve(growing.graph, {}))
+
+
+@pytest.mark.usefixtures("condensing")
+def test_an_edge_to_an_eliminated_frame_counts_as_any_other() -> None:
+    arrivals, truth = _turns(5 * PER_TURN - 4, np.random.default_rng(23)), turntable(5 * PER_TURN, PER_TURN)
+    growing = Smoother()
+    for edges in arrivals:
+        growing = growing.plus(edges)
+    old, new = 2 * PER_TURN + 1, 5 * PER_TURN - 4
+    rng = np.random.default_rng(24)
+    edges = [
+        edge(new - 1, new, measured(truth, new - 1, new, rng)),
+        edge(old, new, measured(truth, old, new, rng), "span"),
+    ]
+    growing = growing.plus(edges)
+    _assert_near(growing.solution, solve(growing.graph, {}), [3, old, new])

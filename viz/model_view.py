@@ -13,6 +13,7 @@ import rerun.blueprint as rrb
 
 from modeler import se3
 from modeler.export.mesh import MADE_UP_RGB
+from modeler.system.disk_arrays import release
 from modeler.tracking import ModelRenderer, Tracked
 from modeler.types import Array, BoolArray, Frame, ObjectModel, RayImage, Step, areas_m2
 from modeler.viz import entities
@@ -92,7 +93,10 @@ def _merged_points(step: Step, poses: Mapping[int, Array]) -> rr.Points3D:
     """Return the points of all views that have a pose, a colour a view from blue to yellow."""
     frames = [frame for frame in sorted(poses) if frame in step.views]
     stride = math.ceil(max(sum(len(step.views[frame].points_m) for frame in frames), 1) / TRIANGLES)
-    parts = [se3.transform(poses[frame], step.views[frame].points_m[::stride]) for frame in frames]
+    parts = []
+    for frame in frames:
+        parts.append(se3.transform(poses[frame], step.views[frame].points_m[::stride]))
+        release(step.views[frame].points_m)
     along = np.linspace(0.0, 2.0, max(len(frames), 2))[: len(frames)]
     ramps = (70, 40, 255), (100, 190, 225), (255, 190, 60)  # red, green and blue at the first, middle and last view
     shades = np.stack([np.interp(along, [0.0, 1.0, 2.0], ramp) for ramp in ramps], axis=1)

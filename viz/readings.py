@@ -152,8 +152,9 @@ def now_words(step: Step) -> str:
             lines.append(f"  - its modes in the pose graph: {', '.join(f'{100 * w:.0f}%' for w in left)}")
     if not step.edges and not step.last:
         lines.append("- The first view of the object." if step.accepted else f"- {_outcome(step)}")
-    kinds = [edge.kind for edge in step.edges_so_far if step.solution.takes_part(edge)]
+    kinds = [edge.kind for edge in step.edges_so_far if edge.accepted]
     for edge in step.solution.outliers:
+        kinds.remove(edge.kind)
         lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out: the other edges contradict it.")
     lines += [f"- {words}." for words in loop_words(step)] if step.last else []
     rejected = len(step.edges_so_far) - len(kinds)

@@ -29,6 +29,7 @@ T = TypeVar("T")
 INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells
 _PAIRS_TIMED = 3  # until it is said how long all takes
 _WHOLE = 2.6  # a build takes so many times its pass over the frames: 2.4 for the bundled box, 2.75 for the capture cap
+_RECOUNTED = 1.02  # times the edges with which loops were counted: they are so again
 _PULSE_S = 30.0  # between signs of life where there is no bar
 
 
@@ -234,6 +235,7 @@ class Console:
         self._address, self._prior = address, prior
         self._placed: dict[int, bool] = {}  # a lost frame that is placed later occurs twice
         self._loops = 0
+        self._counted = self._seen = 0  # edges when loops were counted last, and in the newest step
         self._doubts: dict[Outcome, set[int]] = {}  # frames by what is doubtful about their masks
         self._advised: set[str] = set()
         self._reported, self._aloud = "", 0
@@ -294,8 +296,13 @@ class Console:
         """Show the result of a frame; a lost frame that is placed later has a second step, and so has the last."""
         from modeler.types import Outcome, loops_closed
 
-        if step.last or any(edge.kind == "closure" for edge in step.edges):  # edges that join frames close none
-            self._loops = loops_closed([edge for edge in step.edges_so_far if edge.accepted])
+        closures = [edge.kind == "closure" for edge in step.edges if edge.accepted]  # edges that join frames close none
+        count, few = len(step.edges_so_far), _RECOUNTED * self._counted
+        if step.last or (any(closures) and not self._seen < count <= few):
+            self._loops, self._counted = loops_closed([edge for edge in step.edges_so_far if edge.accepted]), count
+        else:  # each closes one, unless it alone joins its frame
+            self._loops += sum(closures)
+        self._seen = count
         loops = self._loops
         frame, accepted = step.frame.index, step.accepted
         before, self._placed[frame] = self._placed.get(frame), accepted

@@ -123,8 +123,9 @@ class Fuser:
         """
         if not views:
             return None
-        pairs = [pair for pair in posed_views(views, trajectory) if len(pair[0].points_m)]
-        pairs = pairs[:: -math.ceil(len(pairs) / PREVIEW_VIEWS)]  # the newest among them
+        frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
+        frames = frames[:: -max(math.ceil(len(frames) / PREVIEW_VIEWS), 1)]  # the newest among them
+        pairs = posed_views({frame: views[frame] for frame in frames}, trajectory)[::-1]
         step = math.ceil(sum(len(view.points_m) for view, _ in pairs) / PREVIEW_POINTS)
         clouds = [_posed_points(view, pose, step) for view, pose in one_by_one(pairs)]
         points_m, attributes, weights = (np.concatenate(parts) for parts in zip(*clouds, strict=True))

@@ -5,6 +5,7 @@ factors. Covariances are sums of squares of what back substitution gives, never 
 unobserved direction with a standard deviation of metres does not degrade others of micrometres (Kaess and Dellaert,
 Covariance recovery from a square root information matrix, RAS 2009). Solutions whose loops are others are eliminated
 anew when first asked: an incremental square root takes as long for 200 frames, and saves 20 of 65 ms a frame at 1,000.
+Most frames of larger graphs are eliminated already, see `condensed`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import get_blas_funcs
@@ -20,23 +20,13 @@ from scipy.special import chdtri
 
 from modeler import se3
 from modeler.graph import lazy_gtsam as gtsam
+from modeler.graph.condensed import Condensed, Conditional
 from modeler.graph.optimise import gtsam_graph_of, values_of
 from modeler.graph.pose_graph import ROOT_SIGMA, Factor, PoseGraph
 from modeler.types import Array, FocalLength, Solution
 
 (_trsm,) = get_blas_funcs(("trsm",))  # LAPACK's trtrs starts threads even for the smallest system
 _MOST_LEAVES = 32  # frames: back substitution through as many takes as long as through 1,000 eliminated ones
-
-
-class Conditional(NamedTuple):
-    """A variable given those that are eliminated after it: R ξ + Σ S_j ξ_j ~ N(0, 1)."""
-
-    root: Array
-    """R (6, 6), upper triangular."""
-    others: Array
-    """(6, 6 k), the S_j side by side."""
-    parents: Sequence[int]
-    """The k others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,31 +37,42 @@ class _Elimination:
     root: int
     factors: Sequence[Factor]
     extra: Sequence[gtsam.JacobianFactor]
+    condensed: Condensed | None
+    """Further factors, most of whose frames are eliminated already."""
     _known: dict[int, Conditional] = field(default_factory=dict, init=False)
 
     def conditional(self, variable: int) -> Conditional:
         """Return the conditional of a variable."""
+        if self.condensed is not None and variable in self.condensed.order:
+            return self.condensed.conditional(variable)
         if variable not in self._known:
-            found = self.net.at(self.order[variable])
-            self._known[variable] = Conditional(found.R(), found.S(), found.keys()[1:])
+            self._known[variable] = Conditional.of(self.net.at(self.order[variable] - self._before))
         return self._known[variable]
 
     @cached_property
     def order(self) -> Mapping[int, int]:
         """Number of each variable in the order of elimination."""
-        return {self.net.at(k).firstFrontalKey(): k for k in range(self.net.size())}
+        before = {} if self.condensed is None else self.condensed.order
+        return {**before, **{self.net.at(k).firstFrontalKey(): self._before + k for k in range(self.net.size())}}
 
     @cached_property
     def net(self) -> gtsam.GaussianBayesNet:
         """The conditionals, by Cholesky factorisation; by QR if one direction is so uncertain that Cholesky fails."""
-        linear = gtsam_graph_of(self.factors, self.root, ROOT_SIGMA).linearize(values_of(self.trajectory))
-        for factor in self.extra:
+        frames = dict.fromkeys(frame for factor in self.factors for frame in (factor.target, factor.source))
+        poses = {frame: self.trajectory[frame] for frame in {self.root: None, **frames}}
+        linear = gtsam_graph_of(self.factors, self.root, ROOT_SIGMA).linearize(values_of(poses))
+        for factor in (*self.extra, *(() if self.condensed is None else self.condensed.linear)):
             linear.add(factor)
         ordering = gtsam.Ordering.OrderingType.METIS
         try:
             return linear.eliminateSequential(ordering)
         except RuntimeError:  # GTSAM reports an indeterminate system
             return linear.eliminateSequential(ordering, gtsam.EliminateQR)
+
+    @property
+    def _before(self) -> int:
+        """Number of the variables that are eliminated already."""
+        return 0 if self.condensed is None else len(self.condensed.order)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +95,7 @@ class RelativeCovariance:
         root: int,
         factors: Sequence[Factor],
         extra: Sequence[gtsam.JacobianFactor] = (),
+        condensed: Condensed | None = None,
     ) -> RelativeCovariance:
         """Return the covariances of a solution.
 
@@ -102,8 +104,10 @@ class RelativeCovariance:
             root: the frame without error.
             factors: all that take part.
             extra: further factors of the errors, possibly with variables other than frames.
+            condensed: those of the factors that are condensed already, if any.
         """
-        return cls(trajectory, factors, _Elimination(trajectory, root, factors, extra))
+        others = factors if condensed is None else condensed.new(factors)
+        return cls(trajectory, factors, _Elimination(trajectory, root, others, extra, condensed))
 
     def plus(self, trajectory: Mapping[int, Array], factors: Sequence[Factor]) -> RelativeCovariance:
         """Return the covariances with further frames, each placed by one factor: nothing is eliminated again.
@@ -114,7 +118,8 @@ class RelativeCovariance:
         """
         leaves, all_factors = dict(self.leaves), [*self.factors, *factors]
         if len(leaves) + len(factors) > _MOST_LEAVES:
-            return RelativeCovariance.of(trajectory, self.eliminated.root, all_factors, self.eliminated.extra)
+            known = self.eliminated
+            return RelativeCovariance.of(trajectory, known.root, all_factors, known.extra, known.condensed)
         for factor in factors:
             source_is_new = factor.target in leaves or factor.target in self.eliminated.trajectory
             leaves[factor.source if source_is_new else factor.target] = _leaf(factor, source_is_new=source_is_new)
@@ -147,7 +152,9 @@ class RelativeCovariance:
     def log_determinant(self) -> float:
         """Half the log determinant of the information of all variables."""
         of_leaves = sum(np.log(np.abs(np.diag(leaf.root))).sum() for leaf in self.leaves.values())
-        return float(self.eliminated.net.logDeterminant() + of_leaves)
+        condensed = self.eliminated.condensed
+        of_condensed = 0.0 if condensed is None else condensed.net.logDeterminant()
+        return float(self.eliminated.net.logDeterminant() + of_condensed + of_leaves)
 
     @cached_property
     def _ranks(self) -> Mapping[int, int]:

@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from modeler.graph import lazy_gtsam as gtsam
+from modeler.graph.condensed import Condensed
 from modeler.graph.pose_graph import Factor, chain
 from modeler.significance import QUORUM
 from modeler.types import Array
@@ -24,6 +25,10 @@ _ANCHOR_SIGMA = 1e-6  # rad and m, of the root: far below any registration's
 _RELINEARISE = 1e-3  # rad and m from the linearisation point: relative error of a factor's residual
 _WILDFIRE = 1e-5  # changes in rad and m below which iSAM2 stops back substitution
 MAX_ROUNDS = 8  # of whatever iterates over solutions; if more are needed, the initial value was too far off
+CONDENSED_FROM = 1000  # frames: below, condensing saves nothing
+_RENEWED_AT = 256, 16  # frames since a graph was condensed, at least and as a share of all, with which it is so again
+_NEWEST = 2  # frames to which a next one may be registered, of a condensed graph
+_MOST_LEFT = 64  # frames of a condensed graph, all of which depend on each other
 
 Inlier = tuple[bool, ...]  # whether each loop takes part, in their order
 
@@ -96,14 +101,17 @@ def values_of(poses: Mapping[int, Array]) -> gtsam.Values:
     return values
 
 
-def poses_of(values: gtsam.Values, frames: Iterable[int], root: int) -> dict[int, Array]:
-    """Return object_from_camera (4, 4) by frame number; the root's, fixed by `anchor`, is the identity."""
+def poses_of(values: gtsam.Values, start: Mapping[int, Array], root: int) -> dict[int, Array]:
+    """Return object_from_camera (4, 4) of the frames of `start`, where `values` has none from there.
+
+    The root's, fixed by `anchor`, is the identity.
+    """
     rows = np.asarray(gtsam.utilities.extractPose3(values), dtype=np.float64)  # by key: rotation, translation
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
     # Copies: a view kept as a linearisation point would keep all poses of this solution in memory.
     found = {frame: pose.copy() for frame, pose in zip(values.keys(), poses, strict=True)}
-    return {frame: found[frame] for frame in frames} | {root: np.eye(4)}
+    return {**start, **found, root: np.eye(4)}
 
 
 def inliers(loops: Iterable[Factor], values: gtsam.Values, threshold: float) -> tuple[bool, ...]:
@@ -144,18 +152,23 @@ class IncrementalSolver:
     """Factors with their iSAM2 solution. Immutable: `plus` works on a copy, which is cheap."""
 
     factors: frozenset[Factor]
-    """Those that take part."""
+    """Those that take part, and those that are condensed."""
     engine: gtsam.ISAM2
     """Never modified."""
+    condensed: Condensed | None = None
+    """Those that the engine holds as a Gaussian of a few of their frames."""
 
     @classmethod
-    def of(cls, factors: Sequence[Factor], poses: Mapping[int, Array], root: int) -> IncrementalSolver | None:
+    def of(
+        cls, factors: Sequence[Factor], poses: Mapping[int, Array], root: int, condensed: Condensed | None = None
+    ) -> IncrementalSolver | None:
         """Return the solver of factors that connect all frames of `poses`; None if it does not converge.
 
         Args:
             factors: those that take part.
             poses: object_from_camera (4, 4) by frame number, near the optimum.
             root: the frame whose pose is the identity.
+            condensed: further ones, with the root.
         """
         for factorisation in ("CHOLESKY", "QR"):
             parameters = gtsam.ISAM2Params()
@@ -163,23 +176,74 @@ class IncrementalSolver:
             parameters.setRelinearizeThreshold(_RELINEARISE)
             parameters.relinearizeSkip = 1
             parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE))
-            gtsam_graph = gtsam.NonlinearFactorGraph()
+            gtsam_graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
             gtsam_graph.add(anchor(root))
-            found = _updated(gtsam.ISAM2(parameters), gtsam_graph, factors, poses)
-            if found is not None:
-                return found
+            if condensed is not None:
+                values.insert(condensed.poses)
+                for factor in condensed.between():
+                    gtsam_graph.push_back(factor)
+            engine = _updated(gtsam.ISAM2(parameters), (gtsam_graph, values), factors, poses)
+            if engine is not None:
+                known = frozenset() if condensed is None else condensed.factors
+                return cls(known.union(factors), engine, condensed)
         return None
 
     def plus(self, factors: Sequence[Factor], poses: Mapping[int, Array]) -> IncrementalSolver | None:
         """Return the solver with more factors; None if it does not converge.
 
         Args:
-            factors: known ones are skipped.
+            factors: of which it has the frames, but for new ones; known factors are skipped.
             poses: initial object_from_camera (4, 4), at least of the new frames.
         """
         new = [factor for factor in factors if factor not in self.factors]
-        grown = _updated(gtsam.ISAM2(self.engine), gtsam.NonlinearFactorGraph(), new, poses)
-        return None if grown is None else IncrementalSolver(self.factors | grown.factors, grown.engine)
+        start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        engine = _updated(gtsam.ISAM2(self.engine), start, new, poses)
+        return None if engine is None else IncrementalSolver(self.factors.union(new), engine, self.condensed)
+
+    def reaches(self, factors: Sequence[Factor]) -> bool:
+        """Return whether no factor but known ones is of a frame that is eliminated."""
+        return self.condensed is None or self.condensed.covers(self.condensed.new(factors))
+
+    def agrees(self, loops: Sequence[Factor], inlier: Inlier, threshold: float) -> bool:
+        """Return whether the inliers among loops, and no others, are below a threshold at the solution.
+
+        Those that are condensed were tested when they were.
+        """
+        if self.condensed is None:
+            return inliers(loops, self.values, threshold) == inlier
+        kept = [(loop, good) for loop, good in zip(loops, inlier, strict=True) if loop not in self.condensed.factors]
+        return inliers([loop for loop, _ in kept], self.values, threshold) == tuple(good for _, good in kept)
+
+    def is_due(self, frames: int) -> bool:
+        """Return whether a graph of so many frames was condensed so long ago that all of it is to be solved again."""
+        if self.condensed is None:
+            return False
+        least, share = _RENEWED_AT
+        return self.values.size() - len(self.condensed.frames) > max(least, frames // share)
+
+    def lean(
+        self, tree: Sequence[Factor], loops: Sequence[Factor], inlier: Inlier, poses: Mapping[int, Array], root: int
+    ) -> IncrementalSolver:
+        """Return the solver of a large graph condensed to the frames that new ones may be registered against.
+
+        It is the same if the graph is small or condensed, or if too many frames have loops.
+
+        Args:
+            tree: factors that are trusted.
+            loops: the others.
+            inlier: which of them take part.
+            poses: the solution.
+            root: the frame whose pose is the identity.
+        """
+        if self.condensed is not None or len(poses) < CONDENSED_FROM:
+            return self
+        newest = list(poses)[-_NEWEST:]
+        left = frozenset([root, *newest, *(loop.target for loop in loops)])
+        if len(left) > _MOST_LEFT:
+            return self
+        chosen = selected(loops, inlier)
+        condensed = Condensed.of([*tree, *chosen], poses, left, outliers=set(loops).difference(chosen))
+        return IncrementalSolver.of((), poses, root, condensed) or self
 
     @property
     def error(self) -> float:
@@ -193,12 +257,22 @@ class IncrementalSolver:
 
 
 def _updated(
-    engine: gtsam.ISAM2, gtsam_graph: gtsam.NonlinearFactorGraph, factors: Sequence[Factor], poses: Mapping[int, Array]
-) -> IncrementalSolver | None:
-    """Return the solver after an update; None if relinearisation does not converge."""
-    values = gtsam.Values()
+    engine: gtsam.ISAM2,
+    start: tuple[gtsam.NonlinearFactorGraph, gtsam.Values],
+    factors: Sequence[Factor],
+    poses: Mapping[int, Array],
+) -> gtsam.ISAM2 | None:
+    """Return an engine after an update; None if relinearisation does not converge.
+
+    Args:
+        engine: it is modified.
+        start: further factors and values.
+        factors: new ones.
+        poses: initial object_from_camera (4, 4), at least of new frames.
+    """
+    gtsam_graph, values = start
     for frame in dict.fromkeys(frame for factor in factors for frame in (factor.target, factor.source)):
-        if not engine.valueExists(frame):
+        if not (engine.valueExists(frame) or values.exists(frame)):
             values.insert(frame, gtsam.Pose3(poses[frame]))
     for factor in factors:
         gtsam_graph.push_back(factor.between)
@@ -206,7 +280,7 @@ def _updated(
         result = engine.update(gtsam_graph, values)
         for _ in range(MAX_ROUNDS):
             if result.getVariablesRelinearized() == 0:
-                return IncrementalSolver(frozenset(factors), engine)
+                return engine
             result = engine.update()
     except RuntimeError:  # GTSAM reports an indeterminate system
         pass
@@ -221,6 +295,7 @@ def solve_loops(
     root: int,
     threshold: float,
     before: tuple[Inlier, IncrementalSolver | None] = ((), None),
+    growing: bool = True,
 ) -> tuple[Mapping[int, Array], Inlier, IncrementalSolver | None]:
     """Return the poses given all loops, which loops are inliers, and the solver for later updates.
 
@@ -231,10 +306,32 @@ def solve_loops(
         root: the frame whose pose is the identity.
         threshold: half the squared Mahalanobis distance beyond which a loop is an outlier.
         before: which of the loops were inliers of the earlier solution, and its solver.
+        growing: whether the solver of a large graph may be condensed, with which poses of eliminated frames stay as
+            they are until it is so again.
     """
+    poses, inlier, solver = _solved(tree, loops, start, root=root, threshold=threshold, before=before, growing=growing)
+    if growing and solver is not None:
+        solver = solver.lean(tree, loops, inlier, poses, root)
+    return poses, inlier, solver
+
+
+def _solved(
+    tree: Sequence[Factor],
+    loops: Sequence[Factor],
+    start: Mapping[int, Array],
+    *,
+    root: int,
+    threshold: float,
+    before: tuple[Inlier, IncrementalSolver | None],
+    growing: bool,
+) -> tuple[Mapping[int, Array], Inlier, IncrementalSolver | None]:
+    """Return poses, inliers and solver: the earlier one's with what is new, or of all anew."""
     inlier, engine = before
     if engine is not None:
-        found = _continued((inlier, engine), tree, loops, start, threshold)
+        again = engine.condensed is not None and (not growing or engine.is_due(len(start)))
+        found = None if again else _continued((inlier, engine), tree, loops, start, threshold)
+        if found is None and engine.condensed is not None:
+            found = _whole(inlier, tree, loops, start, root=root, threshold=threshold)
         if found is not None:
             return poses_of(found[1].values, start, root), *found
     if not loops:
@@ -253,12 +350,14 @@ def _continued(
     start: Mapping[int, Array],
     threshold: float,
 ) -> tuple[Inlier, IncrementalSolver] | None:
-    """Return which loops are inliers and the updated solver; None if a batch solution is needed.
+    """Return which loops are inliers and the updated solver; None if a batch solution or eliminated frames are needed.
 
     If enough earlier loops agree, some of the new ones may be outliers: of the consistent selections, the one of least
     cost.
     """
     known, engine = before
+    if not engine.reaches([*tree, *loops]):
+        return None
     new = len(loops) - len(known)
     choices = [(True,) * new]
     if sum(known) >= max(QUORUM, 2 * known.count(False)) and new <= QUORUM:
@@ -267,10 +366,25 @@ def _continued(
     for choice in choices:
         inlier = (*known, *choice)
         found = engine.plus([*tree, *selected(loops, inlier)], start)
-        if found is not None and inliers(loops, found.values, threshold) == inlier:
+        if found is not None and found.agrees(loops, inlier, threshold):
             if all(choice):
                 return inlier, found
             cost = found.error + threshold * inlier.count(False)
             if best is None or cost < best[0]:
                 best = cost, inlier, found
     return None if best is None else best[1:]
+
+
+def _whole(
+    known: Inlier,
+    tree: Sequence[Factor],
+    loops: Sequence[Factor],
+    start: Mapping[int, Array],
+    *,
+    root: int,
+    threshold: float,
+) -> tuple[Inlier, IncrementalSolver] | None:
+    """Return which loops are inliers, all new ones too, and the solver of all; None if a batch solution is needed."""
+    inlier = (*known, *[True] * (len(loops) - len(known)))
+    found = IncrementalSolver.of([*tree, *selected(loops, inlier)], start, root)
+    return (inlier, found) if found is not None and found.agrees(loops, inlier, threshold) else None

@@ -43,7 +43,7 @@ class PoseGraph:
         """Number of the frame that fixes the gauge; None in an empty graph."""
         if self.first is not None:
             return self.first
-        return next((edge.target for edge in self.accepted), None)
+        return next((edge.target for edge in self.edges if edge.accepted), None)
 
 
 @dataclass(frozen=True, eq=False)

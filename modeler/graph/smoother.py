@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from modeler.graph.axis import AxisSolution, CommonAxis
+from modeler.graph.condensed import Condensed
 from modeler.graph.covariance import PoseCovariances, RelativeCovariance, SharedCovariance
 from modeler.graph.modes import select_modes
 from modeler.graph.optimise import MAX_ROUNDS, IncrementalSolver, inliers, selected, solve_loops, values_of
@@ -48,7 +49,9 @@ class Smoother:
 
     A frame with one edge is placed by it and moves no other; edges that close loops are passed to iSAM2. Outlier loops
     and modes are selected again only if the earlier selection is no longer consistent. Each solution is that of the
-    whole graph, within the tolerance of the optimisation, however it grew.
+    whole graph, within the tolerance of the optimisation, however it grew; in a graph of a thousand frames, poses of
+    earlier frames follow those of the newest and of the targets of loops only now and then, or if it is solved again
+    without new edges.
     """
 
     shared: float = 0.0
@@ -75,7 +78,7 @@ class Smoother:
         return self.to(self.graph.plus(edges))
 
     def to(self, graph: PoseGraph) -> Smoother:
-        """Return the smoother of a graph; only what its new edges change is computed.
+        """Return the smoother of a graph; only what its new edges change is computed, without new ones all poses.
 
         Raises:
             ValueError: if an accepted edge's covariance is not positive definite, or both axis and shared noise are
@@ -89,7 +92,9 @@ class Smoother:
         factors = self._factors(graph)
         spanning, grew = self._spanning(list(factors.values()), root)
         tree, loops = spanning.tree, spanning.loops
-        closes = not grew or len(loops) > len(self.state.spanning.loops)
+        growing = len(graph.edges) > len(self.graph.edges)
+        settles = not growing and self._condensed is not None
+        closes = not grew or settles or len(loops) > len(self.state.spanning.loops)
         known = len(self.state.spanning.tree)
         odometry = extended(self.solution.odometry, tree[known:]) if grew else chain(tree, root, {})
         weights, decided = self.state.weights, self.state.decided
@@ -105,7 +110,7 @@ class Smoother:
         if closes:  # otherwise each new frame has one edge
             before = ((), None) if mode_changed or not grew else (inlier, solver)
             trajectory, inlier, solver = solve_loops(
-                tree, loops, start, root=root, threshold=self._threshold, before=before
+                tree, loops, start, root=root, threshold=self._threshold, before=before, growing=growing
             )
         before = None if closes or mode_changed else self.state.covariance
         covariance = None if before is None else before.plus(trajectory, tree[known:])
@@ -117,6 +122,11 @@ class Smoother:
                 return again
         state, solution = self._solution(state, (tree, loops), trajectory)
         return replace(self, graph=graph, solution=replace(solution, odometry=odometry), state=state)
+
+    @property
+    def _condensed(self) -> Condensed | None:
+        """What the solver holds of earlier factors as a Gaussian, if it does."""
+        return None if self.state.solver is None else self.state.solver.condensed
 
     @property
     def _threshold(self) -> float:
@@ -143,8 +153,12 @@ class Smoother:
         trajectory = trajectory if with_axis is None else with_axis.poses
         independent = state.covariance
         if independent is None or self.axis is not None:
-            taking_part, extra = [*tree, *selected(loops, inlier)], () if with_axis is None else with_axis.factors
-            independent = RelativeCovariance.of(trajectory, root, taking_part, extra)
+            taking_part = [*tree, *selected(loops, inlier)]
+            if with_axis is not None:
+                independent = RelativeCovariance.of(trajectory, root, taking_part, with_axis.factors)
+            else:
+                condensed = None if state.solver is None else state.solver.condensed
+                independent = RelativeCovariance.of(trajectory, root, taking_part, condensed=condensed)
         relative_covariance = self._covariance(independent)
         several = [factor for factor in (*tree, *loops) if factor.modes]
         state = replace(state, covariance=None if self.axis is not None else independent)

@@ -189,7 +189,9 @@ def _others(search: Search) -> Iterator[int]:
 def _returned_to(search: Search) -> Iterator[int]:
     """Yield earlier views to which the object seems to have returned, but for those registered already."""
     assert search.base is not None
-    tried = {edge.target for edge in search.state.graph.edges if edge.source == search.view.index}
+    frame, tried = search.view.index, set[int]()
+    if frame in search.state.lost:  # only such a frame has edges
+        tried = {edge.target for edge in search.state.graph.edges if edge.source == frame}
     for target in search.closer.closure_targets(search.base, search.state.map_view, last=search.last):
         if target not in tried and target not in search.found:
             yield target

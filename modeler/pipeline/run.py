@@ -158,7 +158,7 @@ class Run:
 
     def refine(self) -> Iterator[Refining]:
         """Register further pairs of views, whose edges make the poses more precise; none if an axis fits all steps."""
-        self.state = self.state.rejudged(self.modeler.closer.judge_span)
+        self.state = self.state.settled().rejudged(self.modeler.closer.judge_span)
         tracker = self.modeler.tracker(self.state)
         if doubtful := self.state.less_probable(self.modeler.prior, tracker.learned_prior):
             pairs = [(edge.source, edge.target) for edge in doubtful]
@@ -437,4 +437,4 @@ class Run:
             views={**views, **compared},
         )
         self.records[step.frame.index] = step.record
-        return replace(step, frames_so_far=tuple(self.records[frame] for frame in sorted(self.records)))
+        return replace(step, frames_so_far=tuple(map(self.records.__getitem__, sorted(self.records))))

@@ -140,7 +140,11 @@ class State:
         again = {(edge.source, edge.target) for edge in new}
         kept = [edge for edge in self.graph.edges if edge.accepted or (edge.source, edge.target) not in again]
         graph = PoseGraph((*kept, *new), self.graph.first)
-        return replace(self, graph=graph, smoother=self.smoother.to(graph))
+        return replace(self, graph=graph, smoother=self.smoother.to(graph)).settled()
+
+    def settled(self) -> State:
+        """Return the state with all poses solved, some of which were not after every frame of a large graph."""
+        return replace(self, smoother=self.smoother.to(self.graph))
 
     def lost_intervals(self) -> list[list[int]]:
         """Return the lost frames in order of time, grouped by the accepted views in between."""

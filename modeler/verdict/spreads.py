@@ -14,6 +14,7 @@ from modeler import se3
 from modeler.fusion import Fuser
 from modeler.fusion.depth_views import BATCH
 from modeler.significance import OUTSIDE
+from modeler.system.disk_arrays import release
 from modeler.types import (
     SOME_POINTS,
     SOME_VIEWS,
@@ -179,22 +180,26 @@ def deformation_by_focal_length(views: Mapping[int, RayImage], solution: Solutio
     frames = [frame for frame in views if focal is not None and frame in focal.by_focal and len(views[frame].points_m)]
     if focal is None or not frames:
         return {}
-    places, shifts = [], []
-    for frame in frames:
-        points_m = views[frame].points_m[:: max(len(views[frame].points_m) // SOME_POINTS, 1)]
+    ends = np.cumsum([len(_some_points_m(views[frame])) for frame in frames])
+    design, shift_m = np.ones((ends[-1], 4)), np.zeros((ends[-1], 3))  # of all views: little else of that size
+    for frame, here, rows in zip(frames, np.split(design, ends[:-1]), np.split(shift_m, ends[:-1]), strict=True):
+        points_m, by_focal = _some_points_m(views[frame]), focal.by_focal[frame]
         place_m = se3.transform(solution.trajectory[frame], points_m)
+        here[:, :3] = place_m
         stretch_m = -(points_m * [1.0, 1.0, 0.0]) @ solution.trajectory[frame][:3, :3].T
-        by_focal = focal.by_focal[frame]
-        places.append(place_m)
-        shifts.append(focal.sigma * (stretch_m + by_focal[3:] + np.cross(by_focal[:3], place_m)))
-    place_m, shift_m = np.concatenate(places), np.concatenate(shifts)
-    design = np.column_stack([place_m - place_m.mean(axis=0), np.ones(len(place_m))])
-    rest_m = shift_m - design @ np.linalg.lstsq(design, shift_m, rcond=None)[0]
-    ends = np.cumsum([len(place) for place in places])[:-1]
+        rows[:] = focal.sigma * (stretch_m + by_focal[3:] + np.cross(by_focal[:3], place_m))
+        release(views[frame].points_m)
+    design[:, :3] -= design[:, :3].mean(axis=0)
+    shift_m -= design @ np.linalg.lstsq(design, shift_m, rcond=None)[0]
     return {
         frame: float(np.sqrt(np.mean(np.sum(part**2, axis=1))))
-        for frame, part in zip(frames, np.split(rest_m, ends), strict=True)
+        for frame, part in zip(frames, np.split(shift_m, ends[:-1]), strict=True)
     }
+
+
+def _some_points_m(view: RayImage) -> Array:
+    """Return some hundreds of the points of a view."""
+    return view.points_m[:: max(len(view.points_m) // SOME_POINTS, 1)]
 
 
 def _of_common_shift(solution: Solution, frame: int, weights: Mapping[int, float]) -> Array:
@@ -263,11 +268,11 @@ def size_check(
         scale_sigma: standard deviation of the scale's logarithm.
         tolerance_m: error of the surface above which a model is wrong.
     """
-    surfaces_m = [
-        se3.transform(trajectory[frame], view.points_m[:: max(len(view.points_m) // SOME_POINTS, 1)])
-        for frame, view in views.items()
-        if frame in trajectory
-    ]
+    surfaces_m = []
+    for frame, view in views.items():
+        if frame in trajectory:
+            surfaces_m.append(se3.transform(trajectory[frame], _some_points_m(view)))
+            release(view.points_m)
     surface_m = np.concatenate(surfaces_m) if surfaces_m else np.zeros((1, 3))
     reach_m = np.quantile(np.linalg.norm(surface_m - surface_m.mean(axis=0), axis=1), 1.0 - MAX_VIOLATIONS)
     return Check(scale_sigma * float(reach_m), tolerance_m)
