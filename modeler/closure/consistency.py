@@ -9,12 +9,12 @@ from itertools import islice, product
 import numpy as np
 
 from modeler import se3
-from modeler.closure.information_gain import RECENT_EDGES
 from modeler.closure.map_view import MapView, ShortestPaths, composed
 from modeler.priors.proposals import INFLATION
 from modeler.registration import VisibilityRegistrar
 from modeler.significance import OUTSIDE, QUORUM, SELDOM, radius
 from modeler.types import (
+    SOME_VIEWS,
     Array,
     Consistency,
     Degenerate,
@@ -68,7 +68,7 @@ class Thresholds:
         the scatter of the run's edges. The correlation of colours depends on print and noise likewise.
         """
         joining = (edge for edge in reversed(edges) if edge.kind == "odometry" and solution.takes_part(edge))
-        recent = [edge.posterior for edge in islice(joining, RECENT_EDGES)]
+        recent = [edge.posterior for edge in islice(joining, SOME_VIEWS)]
         nats = np.array([posterior.log_marginal_likelihood for posterior in recent])
         correlations = np.array([posterior.colour_correlation for posterior in recent])
         nats, correlations = nats[np.isfinite(nats)], correlations[np.isfinite(correlations)]

@@ -12,10 +12,9 @@ from scipy.special import ndtr
 
 from modeler import se3
 from modeler.closure.map_view import MapView, ShortestPaths
-from modeler.types import SOME_POINTS, Array
+from modeler.types import SOME_POINTS, SOME_VIEWS, Array
 
 _MAX_EXACT = 6  # views whose gain is computed exactly: those with the largest bounds
-RECENT_EDGES = 20  # newest ones, whose mean covariance and median evidence are assumed for the next
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ class InformationGain:
         """Mean covariance (6, 6) of the newest edges; None if there are none."""
         solution = self.map_view.solution
         edges = (edge for edge in reversed(self.map_view.edges) if solution.takes_part(edge))
-        recent = [solution.pose_of(edge).covariance for edge in islice(edges, RECENT_EDGES)]
+        recent = [solution.pose_of(edge).covariance for edge in islice(edges, SOME_VIEWS)]
         return np.asarray(np.mean(recent, axis=0) + self.systematic) if recent else None
 
     def _overlap(self, frame: int) -> float:

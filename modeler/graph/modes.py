@@ -15,13 +15,12 @@ import numpy.typing as npt
 
 from modeler import se3
 from modeler.graph.covariance import RelativeCovariance
-from modeler.graph.optimise import optimise, selected
+from modeler.graph.optimise import MAX_ROUNDS, optimise, selected
 from modeler.graph.pose_graph import Factor, chain, walk
 from modeler.significance import SELDOM
 from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are added one by one: all of twelve edges with two modes
-_MAX_OPTIMISED = 8  # hypotheses that are optimised
 _MAX_EXTRA_OUTLIERS = 1.5  # outlier loops more than the best hypothesis before one is dropped: one loop may be wrong
 
 
@@ -161,7 +160,7 @@ def select_modes(
     if best is not None:
         hypotheses, scores = best
         if len(hypotheses) > 1:
-            chosen = (dict(zip(search.edges, row, strict=True)) for row in hypotheses[:_MAX_OPTIMISED])
+            chosen = (dict(zip(search.edges, row, strict=True)) for row in hypotheses[:MAX_ROUNDS])
             evidence = np.array([search.evidence(tree, loops, root, modes, settled) for modes in chosen])
             # Scores along the tree differ from the evidence by nearly the same amount for all of the best.
             scores = np.concatenate([evidence, scores[len(evidence) :] + np.mean(evidence - scores[: len(evidence)])])

@@ -21,6 +21,7 @@ from modeler.suggestion.edge_prediction import TURNS_RAD, USUAL_NOISE, EdgePredi
 from modeler.suggestion.pose_gain import PoseGraphBelief, edge_information
 from modeler.suggestion.surface_cells import STEPS, IntArray, Stand, SurfaceCells
 from modeler.types import (
+    SOME_POINTS,
     AbstractPoseDensity,
     AbstractPrior,
     Array,
@@ -35,7 +36,6 @@ from modeler.types import (
     Solution,
 )
 
-_POINTS: Final = 1500  # of a view, used to evaluate its surface
 _JOINED: Final = 0.85  # 17 of 20 recordings with a turned-over object gave one right model (docs/method/suggestion.md)
 
 
@@ -346,7 +346,7 @@ class Belief:
 
     def _some_points(self, view: RayImage) -> tuple[Array, Array, Array]:
         """Return points (n, 3), normals (n, 3), in the object frame, and variances (n,) in m² of a view."""
-        chosen = np.arange(0, len(view.points_m), max(len(view.points_m) // _POINTS, 1))
+        chosen = np.arange(0, len(view.points_m), max(len(view.points_m) // SOME_POINTS, 1))
         pose = self.solution.trajectory[view.index]
         source = view if view.layers or view is self.last else self.last  # others are as noisy as the last
         found = np.asarray(self.ready(source).layers["variance_m2"], dtype=np.float64)
