@@ -14,11 +14,12 @@ from scipy.special import ndtri
 from modeler.significance import SIGMAS
 from modeler.types import Array, BoolArray, Camera, Float32Array
 
-MOST = 0.5  # the majority of pixels, frames or a rim
+MOST = 0.5  # the majority of pixels, frames or a rim; half of a flat object's height
 MOSTLY = 0.7  # of the measurements at a static pixel agree; of the frames show the object alone, or an arm in place
-CUT_SHARE = 0.1  # share of the mask's width on the image's edge from which the object is truncated
+NEARLY_ALL = 0.98  # of an object is in front of a wall, and above its support
+FEW = 0.1  # of a mask's width on the image's edge truncate it; of a pile stand on its lid; are below a support
 LEAST_PIECE = 0.07  # of the largest: noise along edges, and false depth around limbs, have pieces of up to 6 %
-STRAY_WEIGHT = 0.2  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
+STRAY_WEIGHT = FEW  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
 LEAST_PIXELS = 100  # of an object, or of a plane: fewer tell little of their shape
 HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an image that shows an object alone
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
@@ -282,7 +283,7 @@ def is_cut(mask: BoolArray, edge: BoolArray | None) -> bool:
         return False
     stride = round(len(mask) / len(edge))
     thin = mask[::stride, ::stride]
-    return bool(np.count_nonzero(thin & edge) >= CUT_SHARE * np.sqrt(np.count_nonzero(thin)))
+    return bool(np.count_nonzero(thin & edge) >= FEW * np.sqrt(np.count_nonzero(thin)))
 
 
 def _outermost(seen: BoolArray) -> BoolArray:

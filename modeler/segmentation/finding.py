@@ -10,8 +10,9 @@ import numpy as np
 from scipy import ndimage
 
 from modeler.segmentation.depth_images import (
-    CUT_SHARE,
+    FEW,
     LEAST_PIECE,
+    MOST,
     STRAY_WEIGHT,
     DepthNoise,
     Labels,
@@ -33,7 +34,6 @@ _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports ar
 _MOVED = 0.028  # of an object's outline between the frames from which its scene is learned, as a share of its distance
 _GAP_FLOORS = 15.0  # least gap in noise floors, 12 mm: nearby, the parts of a plush toy are as far apart
 _CREASE = 0.014  # creases of the support are at most so high, and so far from the object, as a share of its distance
-_LOW_SHARE = 0.3  # share of the object's height, for flat objects
 AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
 
 
@@ -187,7 +187,7 @@ def _mostly(chosen: BoolArray, labels: Labels) -> BoolArray:
 
 def _many(ends: BoolArray, labels: Labels) -> BoolArray:
     """Return which labels (k,) so many of whose pixels (n,) are at an end that they continue there."""
-    return np.bincount(labels, ends) > CUT_SHARE * np.sqrt(np.bincount(labels))
+    return np.bincount(labels, ends) > FEW * np.sqrt(np.bincount(labels))
 
 
 def _arm(part: _Part, scene: Scene, zone_m: Array) -> BoolArray:
@@ -375,7 +375,7 @@ def _distance_m(zone_m: Array) -> float:
 
 def _not_a_crease(height_m: Float32Array, fore: BoolArray, highest_m: float, reach_px: float) -> BoolArray:
     """Return the pixels (h, w) that are high above the support or near some that are."""
-    low = min(highest_m, _LOW_SHARE * float(np.percentile(height_m[fore], 95)))
+    low = min(highest_m, MOST * float(np.percentile(height_m[fore], 95)))
     high = (fore & (height_m > low)).astype(np.uint8)
     near: BoolArray = ndimage.maximum_filter(high, 2 * max(1, round(reach_px)) + 1) > 0
     return np.asarray(ndimage.binary_fill_holes(near), dtype=np.bool_)  # a crease surrounds the object

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from modeler.segmentation.depth_images import LEAST_PIXELS, MOSTLY, DepthNoise
+from modeler.segmentation.depth_images import FEW, LEAST_PIXELS, MOSTLY, NEARLY_ALL, DepthNoise
 from modeler.significance import SIGMAS
 from modeler.types import Array, BoolArray, Float32Array, Plane
 
@@ -29,8 +29,6 @@ _SAME_DIRECTION = np.cos(np.radians(20.0))  # between the normals of a cell and 
 _LEVEL = np.cos(np.radians(2.0))
 _LEVEL_BONUS = 1.5  # factor on the votes for level planes
 _PARALLEL = np.cos(np.radians(6.0))  # between the normals of parallel planes, given the accuracy of small ones
-_ABOVE_SHARE = 0.98  # share of an object above its support
-_TOUCHING_SHARE = 0.1  # share of an object's size: 0.04 to 0.06 are left above a support, 0.2 before a near wall
 _REACH_SIZES = 1.5  # radius of an object's surroundings, in sizes of the object
 _MAX_GROUND = 6000  # points; more do not help, since their errors are correlated
 
@@ -243,8 +241,9 @@ def choose_support(planes: Array, body: Float32Array, ground: Float32Array, nois
         seen = np.count_nonzero(np.abs(heights(ground, plane)) < np.median(tolerance))
         lowest, low = np.percentile(height, [1, 5])
         # Bodies that overhang are seen from 0.7 of their size above the support, balls from 0.3.
-        holds = np.mean(height > -tolerance) > _ABOVE_SHARE and low < size
-        holds &= lowest < _TOUCHING_SHARE * size or plane[1] < _UPRIGHT
+        holds = np.mean(height > -tolerance) > NEARLY_ALL and low < size
+        # 0.04 to 0.06 of the size are left above a support, 0.2 before a near wall.
+        holds &= lowest < FEW * size or plane[1] < _UPRIGHT
         merit = (int(grade), -float(np.median(height)))
         if seen >= LEAST_PIXELS and holds and merit > best:
             best, found = merit, plane

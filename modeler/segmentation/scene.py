@@ -12,10 +12,12 @@ from scipy import ndimage
 from modeler.segmentation.arms import Arms
 from modeler.segmentation.background_colour import BackgroundColour
 from modeler.segmentation.depth_images import (
+    FEW,
     HARDLY,
     LEAST_PIECE,
     MOST,
     MOSTLY,
+    NEARLY_ALL,
     STRAY_WEIGHT,
     DepthNoise,
     Labels,
@@ -40,14 +42,10 @@ from modeler.segmentation.planes import (
 from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
 from modeler.views.range_noise import RangeNoise
 
-_CARRIED_SHARE = 0.2  # share of a pile that stands on its upper plane, for that to be a support and not a lid
-_IN_FRONT_SHARE = 0.9  # share of the object that is in front of a wall
 _NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
-_ELSEWHERE = 0.3  # share of the moving pieces' score elsewhere that makes it ambiguous: 0.4 chooses of two alike
-RIVAL = 0.4  # ratio of the score of what else may be the object from which the choice is ambiguous
+RIVAL = 0.3  # ratio of the score of what else may be the object from which it is ambiguous: 0.4 chooses of two alike
 _WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _TOUCHING_PX = 3
-_ON_PLANE, _BELOW = 0.1, 0.2  # shares of the points: at least, and at most for a support plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +174,7 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     ndimage.label(layers.moved & allowed & near, output=regions)
     merit_of = _central(regions, depth, layers.front_share)
     large = merit_of > LEAST_PIECE * merit_of.max()
-    return large[regions], bool(elsewhere.sum() < _ELSEWHERE * merit.sum())
+    return large[regions], bool(elsewhere.sum() < RIVAL * merit.sum())
 
 
 def _standing_object(
@@ -209,7 +207,7 @@ def _standing_object(
         merit = _central(labels, depth, np.ones_like(depth))
         piece = labels == int(merit.argmax())
         off_plane = np.count_nonzero(found & (np.abs(heights(points, level)) > tolerance))
-        if merit.max() > 0.0 and np.count_nonzero(piece) > _CARRIED_SHARE * off_plane:
+        if merit.max() > 0.0 and np.count_nonzero(piece) > FEW * off_plane:
             support, found, levels_used = level, piece, levels_used + 1
     return support, found, levels_used == 1
 
@@ -258,7 +256,7 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
     depth = np.where(outside[labels], back, np.float32(np.inf))
     for plane, goes_on in zip(planes, _beyond_image(planes, rim, noise), strict=True):
         level = support is not None and bool(parallel(plane[None], support)[0])  # the support, or the top of a box
-        if level or np.mean(heights(body, plane) > -body_tolerance_m) < _IN_FRONT_SHARE:
+        if level or np.mean(heights(body, plane) > -body_tolerance_m) < NEARLY_ALL:
             continue
         in_front_m = heights(layers.back_m, plane)
         on = around & (np.abs(in_front_m) < tolerance_m)
@@ -304,6 +302,6 @@ def _supported(depth_m: Float32Array, camera: Camera, noise: DepthNoise) -> bool
     for plane in planes[upright(planes)]:
         height = heights(seen, plane)
         above, below = np.mean(height > tolerance), np.mean(height < -tolerance)
-        if above > HARDLY and below < _BELOW and 1.0 - above - below > _ON_PLANE:
+        if above > HARDLY and below < FEW and 1.0 - above - below > FEW:
             return True
     return False
