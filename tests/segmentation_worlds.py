@@ -54,10 +54,10 @@ def filmed(count, rng, world_of, **noise):
     return [frame for frame, _ in views], [mask for _, mask in views]
 
 
-def segmented(frames, **fields):
-    """Return what is found in frames whose scene is learned from all of them."""
+def segmented(frames, scene=None, **fields):
+    """Return what is found in frames, whose scene is learned from all of them where none is given."""
     segmenter = Segmenter(**fields)
-    scene = segmenter.scene(frames)
+    scene = segmenter.scene(frames) if scene is None else scene
     return [segmenter.segment(frame, scene) for frame in frames]
 
 

@@ -125,8 +125,9 @@ def test_who_walks_all_across_the_image_is_not_taken_for_a_moving_camera(rng):
         return world.box((-0.6 + 0.17 * k, 0.25, 0.3), (0.16, 0.03, 0.6))
 
     frames, masks = turned(8, rng, surround, tilt_deg=5.0, distance_m=0.7)
-    assert Segmenter().scene(frames).still
-    assert least_iou(segmented(frames), masks) > 0.9
+    scene = Segmenter().scene(frames)
+    assert scene.still
+    assert least_iou(segmented(frames, scene), masks) > 0.9
 
 
 def test_a_board_behind_the_object_is_not_part_of_it(rng):
@@ -198,7 +199,7 @@ def test_depth_that_is_noisier_than_expected_is_not_taken_for_a_moving_camera(rn
     assert scene.still
     assert not scene.camera_moves
     assert scene.noise is not None
-    judge(frames, masks, least=0.9)
+    judge(frames, masks, least=0.9, scene=scene)
     half_round = [replace(frame, depth_m=frame.depth_m[::-1, ::-1]) for frame in frames]  # hung upside down
     judge(half_round, [mask[::-1, ::-1] for mask in masks], least=0.9)
 
@@ -218,14 +219,15 @@ def test_a_near_object_that_fills_half_of_the_image_is_not_taken_for_a_moving_ca
     scene = Segmenter().scene(frames)
     assert not scene.camera_moves
     assert scene.plane is not None
-    assert least_iou(segmented(frames), masks) > 0.9
+    assert least_iou(segmented(frames, scene), masks) > 0.9
 
 
 def test_an_object_that_the_image_cuts_off_in_all_frames_is_found_as_far_as_it_is_seen(rng):
     """Its own sides at the image's edge are no walls, nor is it an arm that something else would be left without."""
     frames, masks = turned_box(0.42, (0.12, 0.07, 0.1), rng)
-    found = segmented(frames)
-    assert not Segmenter().scene(frames).arms
+    scene = Segmenter().scene(frames)
+    found = segmented(frames, scene)
+    assert not scene.arms
     assert least_iou(found, masks) > 0.9
     assert {one.outcome for one in found} == {Outcome.CUT_OFF}
 
@@ -244,8 +246,10 @@ def in_the_air(turn_deg, rng):
 
 def test_an_arm_that_holds_the_object_in_the_air_is_left_out(rng):
     frames, masks = in_the_air(25.0, rng)
-    assert not Segmenter().scene(frames).doubts
-    assert np.median([iou(one.mask, mask) for one, mask in zip(segmented(frames), masks, strict=True)]) > 0.9
+    scene = Segmenter().scene(frames)
+    assert not scene.doubts
+    found = segmented(frames, scene)
+    assert np.median([iou(one.mask, mask) for one, mask in zip(found, masks, strict=True)]) > 0.9
 
 
 def test_masks_are_asked_for_where_what_may_be_an_arm_turns_as_the_rest(rng):
@@ -304,11 +308,11 @@ def island(k):
 
 def test_what_stands_before_nothing_is_all_the_object(rng):
     frames, masks = filmed(8, rng, island)
-    for one in judge(frames, masks, least=0.9):
-        assert one.plane is None
     segmenter = Segmenter()
     scene = segmenter.scene(frames)
     assert scene.alone
+    for one in judge(frames, masks, least=0.9, scene=scene):
+        assert one.plane is None
     depth = frames[0].depth_m.copy()
     depth[:, -40:] = 0.9  # somebody's sleeve
     assert segmenter.segment(replace(frames[0], depth_m=depth), scene).outcome is Outcome.UNSURE_MASK
