@@ -222,6 +222,26 @@ def test_what_stays_in_its_place_is_found_though_centroids_err(printed):
     assert all(pair.colour.static_correlation(band) > 0.8 for band in range(3))
 
 
+def test_noise_of_colours_counts_more_than_print_unless_it_is_light_that_stays(printed):
+    (view, other), _ = printed
+    aside = recoloured(view, np.roll(np.asarray(view.frame.colour), (1, -1), axis=(0, 1)))
+    for target, noise in ((other, 400.0), (aside, 140.0)):
+        colour = VisibilityLikelihood().between(view, target, np.random.default_rng(0)).colour
+        static = 1.0 - colour.static_correlation(0) ** 2
+        found = static / colour.independent(0, np.array([0.0, 1.0])) - 1.0 / colour.patches(0)
+        np.testing.assert_allclose(1.0 / found, [noise, 140.0], rtol=0.1)
+
+
+def test_the_curvature_of_colours_is_the_slope_of_their_gain(printed):
+    views, _ = printed
+    colour = VisibilityLikelihood().between(views[0], views[1], np.random.default_rng(0)).colour
+    for correlation in (0.2, 0.8):
+        squares = correlation**2 + np.array([-1e-4, 1e-4])
+        gains = colour.independent(0, np.sqrt(squares)) * squares
+        slope = float(np.diff(gains)[0]) / 2e-4
+        np.testing.assert_allclose(colour.curvature(correlation, 0), correlation * slope, rtol=1e-3)
+
+
 def test_a_shift_of_colours_is_eliminated(rng):
     root, shifts = rng.normal(size=(6, 6)), rng.normal(size=(6, 2))
     information = root @ root.T

@@ -82,8 +82,11 @@ class VisibilityLikelihood:
     max_independent: float = 300.0
     """Largest number of independent measurements in the points of both views, limited by common errors."""
     max_independent_colours: float = 140.0
-    """The same for their colours. Under wrong poses, correlations in the finest band have the variance of 110 to 270
-    independent features, on drawn bodies with print and without; with 200, peaks of real print are hard to sample."""
+    """The same for colours that are print, whose common errors are those of surface and of where colours lie on it:
+    with 200, peaks of real print are hard to sample."""
+    max_independent_noise: float = 400.0
+    """The same for colours that are noise. Under wrong poses, correlations in the finest band scatter about their mean
+    as those of 200 to 1,000 independent features, on drawn bodies with print and without."""
     no_overlap_cost: float = 50.0
     """Cost (nats) of a pose under which no surface matches."""
     overlap_scale: float = 0.1
@@ -102,7 +105,8 @@ class VisibilityLikelihood:
         if not coloured:
             return PairLikelihood(forward, backward, size_m)
         plain = PairLikelihood(forward, backward, size_m)
-        return replace(plain, colour=PairColour(source, target, *chosen))
+        limits = self.max_independent_colours, self.max_independent_noise
+        return replace(plain, colour=PairColour(source, target, *chosen, *limits))
 
     def denser(self, pair: PairLikelihood, rng: np.random.Generator) -> PairLikelihood:
         """Return the likelihood of a pair at more points, for refinement; the same if it already has all of them."""
@@ -189,8 +193,7 @@ class PairLikelihood:
         plain, share = stride * found[:, scores.LOG_LIKELIHOOD], stride * found[:, scores.EXPLAINED] / self.points
         if self.colour is None:
             return Scores(plain, share, np.zeros(len(poses)))
-        most = self.forward.model.max_independent_colours
-        return Scores(plain, share, self.colour.log_likelihoods(found, band, most, stride=stride))
+        return Scores(plain, share, self.colour.log_likelihoods(found, band, stride=stride))
 
     def _summed(self, poses: Array, blur_m: float, band: int, *, stride: int, typical_misfit: float) -> Array:
         """Return the sums (n, 6) of `scores.scores` of `rows_under`, see `scores`; `band` is that of the colours."""
@@ -244,15 +247,16 @@ class PairLikelihood:
         """Return how well the colours of matching surface agree under a pose (4, 4), and how many are independent.
 
         It is the largest correlation of the bands for some blurs (k,), as displaced colours agree in wide bands only;
-        NaN without colour. The number is that of the finest band.
+        NaN without colour. The number is that of print in the finest band.
         """
         if self.colour is None:
             return math.nan, 0.0
-        most, found = self.forward.model.max_independent_colours, []
+        found = []
         for blur_m in blurs_m:
             band = self.colour.band(float(blur_m))
             summed = self._summed(rows(pose[None]), float(blur_m), band, stride=1, typical_misfit=MISFIT)
-            found.append((float(correlations(summed)[0]), float(self.colour.compared(summed, band, most, stride=1)[0])))
+            count = self.colour.compared(summed, band, np.ones(1), stride=1)
+            found.append((float(correlations(summed)[0]), float(count[0])))
         largest, counts = np.max(found, axis=0)
         return float(largest), float(counts)
 
@@ -410,8 +414,7 @@ class PairLikelihood:
         if self.colour is not None:
             band = self.colour.band(blur_m)
             found = self._summed(rows(poses[:1]), blur_m, band, stride=1, typical_misfit=MISFIT)
-            most = self.forward.model.max_independent_colours
-            weight = self.colour.curvature(correlations(found)[0], band, most) / self.points
+            weight = self.colour.curvature(float(correlations(found)[0]), band) / self.points
         colours = self._colours(band, stride)
         _, (of_surface, of_colours) = (
             part.swapaxes(0, 1)

@@ -50,6 +50,10 @@ class PairColour:
     """(n,) indices of the source's surface points to compare."""
     target_points: np.ndarray
     """(m,) of the target's."""
+    max_print: float
+    """Largest number of independent features of print, limited by errors that distant points share."""
+    max_noise: float
+    """Largest number of independent features of noise."""
     _shifts_px: dict[int, Array] = field(default_factory=dict)
     _static_correlations: dict[int, float] = field(default_factory=dict)
     _residuals: dict[int, tuple[_Features, _Features]] = field(default_factory=dict)
@@ -64,32 +68,44 @@ class PairColour:
         blur_px = blur_m * self.target.frame.camera.fx / max(float(self.target.centroid_m[2]), 1e-3)
         return min(round(math.log2(max(blur_px / FINEST_PX, 1.0))), BANDS - 1)
 
-    def log_likelihoods(self, scored: Array, band: int, max_independent: float, *, stride: int) -> Array:
+    def log_likelihoods(self, scored: Array, band: int, *, stride: int) -> Array:
         """Return log L_c (n,) in nats: colours of matching surface against independent ones (method, eq. 7.3).
 
         Args:
             scored: (n, 6) `scores.scores` of poses, with the colours of a band.
             band: index of the band.
-            max_independent: largest number of independent features.
             stride: every `stride`-th point was used.
         """
-        count = self.compared(scored, band, max_independent, stride=stride)
+        found = correlations(scored)
+        count = self.compared(scored, band, found, stride=stride)
         # To first order in ρ²: the exact logarithm has peaks too narrow to sample.
-        gain = 0.5 * count * np.maximum(correlations(scored), 0.0) ** 2
+        gain = 0.5 * count * np.maximum(found, 0.0) ** 2
         return np.asarray(np.logaddexp(0.0, gain - 0.5 * np.log(np.maximum(count, 1.0))), dtype=np.float64)
 
-    def compared(self, scored: Array, band: int, max_independent: float, *, stride: int) -> Array:
-        """Return the numbers n_c (n,) of independent features that are compared; arguments as `log_likelihoods`."""
+    def compared(self, scored: Array, band: int, correlation: Array, *, stride: int) -> Array:
+        """Return the numbers n_c (n,) of independent features that are compared (method, eq. 7.3).
+
+        Args:
+            scored: as for `log_likelihoods`.
+            band: index of the band.
+            correlation: (n,) of the features.
+            stride: as for `log_likelihoods`.
+        """
         points = sum(len(colours.values) for colours in self.colours(band, stride))
-        return np.asarray(scored[:, scores.MATCHES] / points * self.independent(band, max_independent))
+        return np.asarray(scored[:, scores.MATCHES] / points * self.independent(band, correlation))
 
-    def curvature(self, correlation: float, band: int, max_independent: float) -> float:
+    def curvature(self, correlation: float, band: int) -> float:
         """Return twice the decrease of `log_likelihoods` per mean square difference of features."""
-        return self.independent(band, max_independent) * max(correlation, 0.0)
+        here, without = self.independent(band, np.array([correlation, 0.0]))
+        return float(here**2 / max(without, 1e-12)) * max(correlation, 0.0)  # d(n_c ρ²) / dρ² is n_c² / n_c(0)
 
-    def independent(self, band: int, max_independent: float) -> float:
-        """Return the number of independent features if all surface matches (method, eq. 7.3)."""
-        return (1.0 - self.static_correlation(band) ** 2) / (1.0 / max_independent + 1.0 / self.patches(band))
+    def independent(self, band: int, correlation: Array) -> Array:
+        """Return the numbers (n,) of independent features with correlations (n,) if all surface matches (eq. 7.3)."""
+        static, wider = (self.static_correlation(one) for one in (band, min(band + 1, BANDS - 1)))
+        max_noise = max((1.0 - wider**2) * self.max_noise, self.max_print)  # light that stays is not quite subtracted
+        of_print = np.clip(correlation, 0.0, 1.0) ** 2
+        limits = of_print / self.max_print + (1.0 - of_print) / max_noise
+        return np.asarray((1.0 - static**2) / (limits + 1.0 / self.patches(band)))
 
     def shifts(self, poses: Array) -> Array:
         """Return E (..., 6, 2), motions ξ that shift the target's colours by a standard deviation along both axes.
