@@ -6,12 +6,17 @@ GTSAM's `Pose3`, applied from the right: `pose @ exp(ξ)`. Every 6×6 covariance
 leading axes.
 """
 
+from typing import Final
+
 import numpy as np
 import numpy.typing as npt
 
 from modeler.kernels import lie_group
 
 Array = npt.NDArray[np.float64]
+
+Y_UP: Final = np.diag([1.0, -1.0, -1.0])
+"""Turns x right, y down, z forward into x right, y up, z back, as OpenGL and glTF have it, and back."""
 
 
 def hat(vector: Array) -> Array:

@@ -17,6 +17,7 @@ from typing import BinaryIO, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from modeler import se3
 from modeler.sequences.file_names import frame_numbers, said_of_angles
 from modeler.sequences.image_files import LEAST_MM, MAX_PIXELS
 from modeler.sequences.input_files import input_errors, list_images
@@ -89,7 +90,7 @@ class CloudSequence(AbstractRecording):
 Axes = Literal["camera", "viewer", "body"]
 _CAMERA_FROM: Final[Mapping[Axes, Array]] = {
     "camera": np.eye(3),
-    "viewer": np.diag([1.0, -1.0, -1.0]),
+    "viewer": se3.Y_UP,
     "body": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
 }
 """Rotations (3, 3) into the camera frame: x right, y down, z forward."""

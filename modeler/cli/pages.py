@@ -98,11 +98,10 @@ class Gallery:
         from urllib.parse import quote
 
         from modeler.batch.jobs import NOTES
-        from modeler.batch.models import TABLE, blank, closed_in, models_in, thumbnail_of, write_table
+        from modeler.batch.models import TABLE, closed_in, models_in, thumbnail_of, write_gallery, write_table
         from modeler.runs.outputs import check_files
         from modeler.system.regular_files import read_regular
         from modeler.types import InputError
-        from modeler.viz.report.gallery import write_gallery
 
         out = self.folder / "gallery.html" if self.out is None else self.out
         check_files([out], [], overwrite=self.overwrite)
@@ -125,7 +124,7 @@ class Gallery:
                 page = next((page for page in pages if page.exists()), None)
                 if page is not None:
                     links[name] = quote(Path(os.path.relpath(page, out.parent)).as_posix())
-        write_gallery(out, self.folder.absolute().name, [blank() | row for row in rows], pictures, links)
+        write_gallery(out, self.folder.absolute().name, rows, pictures, links)
         say(f"open {out} in a browser")
         return 0
 

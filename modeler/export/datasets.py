@@ -165,7 +165,7 @@ def _box(mask: BoolArray) -> list[int]:
 
 
 _PIXEL_CENTRE: Final = 0.5  # nerfstudio and COLMAP measure from the corner of the first pixel
-_OPENGL_AXES: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, z backward
+_OPENGL_AXES: Final = se3.rigid(se3.Y_UP, np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)

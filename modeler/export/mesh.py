@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from modeler import se3
 from modeler.export.files import mesh_ply, write_atomically
 from modeler.export.placing import CAMERA_AXES
 from modeler.system.pictures import encoded, linear_light, raycaster, tensor
@@ -21,7 +22,7 @@ from modeler.types import Array, BoolArray, InputError, ObjectModel, area_vector
 
 FORMATS = (".ply", ".obj", ".glb", ".stl", ".3mf")
 TEXTURED = (".obj", ".glb")
-AS_GIVEN: Final = np.diag([1.0, -1.0, -1.0])
+AS_GIVEN: Final = se3.Y_UP
 """For a mesh whose y axis is already up: reverses the rotation to glTF's axes."""
 
 Tint = Literal["views", "sigma"]
@@ -151,10 +152,8 @@ def _glb(model: ObjectModel, texture: Texture | None, object_from_upright: Array
         mesh.vertex_attributes["_COLOR_0"] = linear_rgb(model.vertex_colours).astype(np.float32)
     mesh.visual = TextureVisuals(uv=None if texture is None else texture.uv, material=material)
     scene = trimesh.Scene()
-    turn = np.diag([1.0, -1.0, -1.0, 1.0])  # glTF: y up, and the front towards +z
-    if object_from_upright is not None:
-        turn[:3, :3] @= object_from_upright.T
-    scene.add_geometry(mesh, transform=turn)
+    turn = se3.Y_UP if object_from_upright is None else se3.Y_UP @ object_from_upright.T  # the front towards +z
+    scene.add_geometry(mesh, transform=se3.rigid(turn, np.zeros(3)))
     data = gltf.export_glb(scene, include_normals=True, tree_postprocessor=_with_colours)
     assert isinstance(data, bytes)
     return data

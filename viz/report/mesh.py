@@ -82,7 +82,6 @@ def scene(mesh: Mesh, strips_m: list[Array], object_from_upright: Array) -> Mapp
         strips_m: lines around it, each (n, 3): cameras.
         object_from_upright: (3, 3) right, down and forward as columns: initial orientation.
     """
-    eye_from_upright = np.diag([1.0, -1.0, -1.0])  # whose y is up and whose z points back
     places = np.rint((mesh.vertices_m - mesh.centre_m) / mesh.radius_m * _STEPS).astype("<i2")
     lines = [np.repeat(strip, 2, axis=0)[1:-1] for strip in strips_m]
     segments = np.concatenate([np.zeros((0, 3)), *lines])
@@ -94,7 +93,7 @@ def scene(mesh: Mesh, strips_m: list[Array], object_from_upright: Array) -> Mapp
         "triangles": _packed(mesh.triangles.astype("<u4")),
         "lines": _packed(((segments - mesh.centre_m) / mesh.radius_m).astype("<f4")),
         "count": int(mesh.triangles.size),
-        "upright": (eye_from_upright @ object_from_upright.T).T.ravel().round(6).tolist(),  # column by column
+        "upright": (se3.Y_UP @ object_from_upright.T).T.ravel().round(6).tolist(),  # column by column
     }
 
 
