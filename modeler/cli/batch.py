@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from modeler.cli.console import bar, say
-from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, as_arguments
-from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
+from modeler.cli.options import AbstractBuild
+from modeler.composition.options import default
 
 if TYPE_CHECKING:
     from modeler.batch.jobs import Ended, Job
@@ -22,7 +22,7 @@ _LISTED = 20  # sequences without a good model that are listed individually
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(AbstractBuild):
     """Build models of many sequences, each into its own run folder below DIR, and list them in DIR/models.parquet.
 
     The options of `modeler build` apply to every sequence. When repeated, the same command skips finished sequences,
@@ -54,12 +54,6 @@ class Batch:
     """Retry sequences that failed twice."""
     pages: bool = False
     """Also write the HTML report of each model (some 10 s each)."""
-    model: ModelOptions = field(default_factory=ModelOptions)
-    prior: PriorOptions = field(default_factory=PriorOptions)
-    method: MethodOptions = field(default_factory=MethodOptions)
-    selection: FrameOptions = field(default_factory=FrameOptions)
-    where: ObjectOptions = field(default_factory=ObjectOptions)
-    given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
         """Build the remaining sequences, and list all.
@@ -130,8 +124,7 @@ def _jobs(options: Batch) -> list[Job]:
     from modeler.cli.manifest import Row, named, read_manifest
     from modeler.types import InputError
 
-    groups = (options.model, options.prior, options.method, options.selection, options.where, options.given)
-    common = as_arguments(*groups)
+    common = options.arguments()
     rows = [Row(path, f"{path}") for path in options.sequences]
     if options.manifest is not None:
         rows += read_manifest(options.manifest, common)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from modeler.cli.console import Console, Interrupt, as_options, say, trusted_status
-from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, WatchOptions, check_voxel, given_options
-from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
+from modeler.cli.options import AbstractBuild, WatchOptions, check_voxel, given_options
+from modeler.composition.options import MethodOptions, PriorOptions, default
 from modeler.runs.compiling import compile_kernels
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _SHOWN_REASONS = 3  # not to trust a model; the report has all
 
 
 @dataclass(frozen=True)
-class Build:
+class Build(AbstractBuild):
     """Build the model of an object from a sequence: register its frames, close loops, fuse.
 
     Ctrl-C ends the run with the frames so far, and makes the model from them.
@@ -53,12 +53,6 @@ class Build:
     connect: Annotated[str | None, tyro.conf.arg(metavar="URL"), default("none")] = None
     """Watch in a Rerun viewer that is already open: rerun+http://HOST:PORT/proxy."""
     watching: WatchOptions = field(default_factory=WatchOptions)
-    model: ModelOptions = field(default_factory=ModelOptions)
-    prior: PriorOptions = field(default_factory=PriorOptions)
-    method: MethodOptions = field(default_factory=MethodOptions)
-    selection: FrameOptions = field(default_factory=FrameOptions)
-    where: ObjectOptions = field(default_factory=ObjectOptions)
-    given: InputOptions = field(default_factory=InputOptions)
 
     def run(self) -> int:
         """Run the loop into a run folder; status 3 if the model cannot be trusted; report.json has the reasons."""

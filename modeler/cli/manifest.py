@@ -13,11 +13,9 @@ from functools import cache
 from pathlib import Path
 
 from modeler.batch.jobs import NOTES, read_note
-from modeler.cli.options import FrameOptions, InputOptions, ModelOptions, as_arguments
-from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions
+from modeler.cli.options import AbstractBuild
 from modeler.types import InputError
 
-_GROUPS = (ModelOptions, PriorOptions, MethodOptions, FrameOptions, ObjectOptions, InputOptions)
 _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
 _FLAGS = {"colour": ("--no-colour", _NO)}  # and the answers that give them
 _FLAGS |= {name: (f"--{name}", _YES) for name in ("strict-paths", "along-ray", "despite-doubts")}
@@ -52,7 +50,8 @@ def read_manifest(path: Path, common: tuple[str, ...] = ()) -> list[Row]:
         rows = list(lines)
     except csv.Error as error:
         raise InputError(f"{path}: is not a CSV table ({error}); correct it") from None
-    flags = {one.name.replace("_", "-"): isinstance(one.default, bool) for group in _GROUPS for one in fields(group)}
+    groups = [group.default_factory() for group in fields(AbstractBuild) if callable(group.default_factory)]
+    flags = [one.name.replace("_", "-") for group in groups for one in fields(group)]
     known = ("sequence", "name", *flags)
     if "sequence" not in columns.values():
         raise InputError(f"{path}: has no column sequence; write one line of names, and a row for each sequence")
@@ -109,7 +108,7 @@ def _checked(words: tuple[str, ...], common: tuple[str, ...]) -> tuple[str, ...]
     if alone is None:
         return ()
     assert isinstance(alone, Build)
-    return as_arguments(alone.model, alone.prior, alone.method, alone.selection, alone.where, alone.given)
+    return alone.arguments()
 
 
 def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:

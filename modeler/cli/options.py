@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from modeler.composition.options import default
+from modeler.composition.options import MethodOptions, ObjectOptions, PriorOptions, default
 
 if TYPE_CHECKING:
     from modeler.sequences import Overrides
@@ -97,14 +97,6 @@ def given_options(*groups: object) -> dict[str, tuple[object, ...]]:
     return found
 
 
-def as_arguments(*groups: object) -> tuple[str, ...]:
-    """Return the command line that gives groups of options the values they have; files are named by absolute paths."""
-    words: list[str] = []
-    for name, values in given_options(*groups).items():
-        words += [name, *(str(value.absolute() if isinstance(value, Path) else value) for value in values)]
-    return tuple(words)
-
-
 @dataclass(frozen=True)
 class InputOptions:
     """Values that override the input's."""
@@ -135,3 +127,23 @@ class InputOptions:
         """Return what was given, as recorded in report.json."""
         unrecorded = ("despite_doubts", "strict_paths")
         return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) and f.name not in unrecorded}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AbstractBuild:
+    """Options that builds have alone and in a batch."""
+
+    model: ModelOptions = field(default_factory=ModelOptions)
+    prior: PriorOptions = field(default_factory=PriorOptions)
+    method: MethodOptions = field(default_factory=MethodOptions)
+    selection: FrameOptions = field(default_factory=FrameOptions)
+    where: ObjectOptions = field(default_factory=ObjectOptions)
+    given: InputOptions = field(default_factory=InputOptions)
+
+    def arguments(self) -> tuple[str, ...]:
+        """Return the command line that gives these options the values they have; files by absolute paths."""
+        groups = (getattr(self, one.name) for one in fields(AbstractBuild))
+        words: list[str] = []
+        for name, values in given_options(*groups).items():
+            words += [name, *(str(value.absolute() if isinstance(value, Path) else value) for value in values)]
+        return tuple(words)
