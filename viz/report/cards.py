@@ -23,6 +23,7 @@ from modeler.viz import entities
 from modeler.viz.blueprint import FROM_THE_SIDE
 from modeler.viz.reader import FRAME_PATHS
 from modeler.viz.readings import certainty_words
+from modeler.viz.report.mesh import look_at
 from modeler.viz.report.run_data import Result, Row, cloud
 
 _TERMS: Final = {
@@ -341,13 +342,9 @@ def _pair_picture(*clouds: tuple[Array, npt.NDArray[np.uint8]]) -> bytes:
     """Return two clouds seen from the side, nearer points over farther ones; the first says where to look."""
     points = np.concatenate([cloud for cloud, _ in clouds])
     colours = np.concatenate([colour for _, colour in clouds])
-    forward = -FROM_THE_SIDE / np.linalg.norm(FROM_THE_SIDE)
-    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(forward, right), forward])
-    centre = clouds[0][0].mean(axis=0)
-    seen = (points - centre) @ axes.T
-    reach_m = float(np.percentile(np.abs((clouds[0][0] - centre) @ axes.T), 99.5))
+    eye = look_at(clouds[0][0].mean(axis=0), FROM_THE_SIDE, 0.0, np.array([0.0, -1.0, 0.0]))
+    seen = se3.transform(se3.inverse(eye), points)
+    reach_m = float(np.percentile(np.abs(seen[: len(clouds[0][0])]), 99.5))
     height, width = _SIZE
     places = np.rint(seen[:, :2] * (0.40 * height / max(reach_m, 1e-9)) + 0.5 * np.array([width, height]))
     dot = np.argwhere(np.ones((2, 2)))  # its pixels
