@@ -6,7 +6,9 @@ import io
 import itertools
 import math
 import re
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from modeler.graph import PoseGraph, dead_reckoning
 from modeler.types import Failed, Outcome, Plane, PoseGaussian, Segmentation, Solution, Step
 from modeler.viz import blueprint, entities, graph_view, images, model_view, pair_view
 from modeler.viz.readings import pose_table, sd_of
-from modeler.viz.stream import graph_due, open_stream
+from modeler.viz.stream import all_due, open_stream
 
 PAIR_CLOUDS = (entities.PAIR_TARGET, entities.PAIR_BEFORE, entities.PAIR_AFTER)
 GHOSTS = (entities.GHOSTS, entities.GHOST_MEANS, entities.GHOST_TIPS)
@@ -379,11 +381,25 @@ def test_a_coarsened_mesh_keeps_its_shape() -> None:
     assert all_of_them is triangles
 
 
-def test_the_whole_graph_is_drawn_a_number_of_times_that_hardly_grows(run: list[Step]) -> None:
+def test_model_and_graph_are_drawn_a_number_of_times_that_hardly_grows(run: list[Step]) -> None:
     view = run[0].views[0]
     steps = [replace(run[1], views=dict.fromkeys(range(count), view)) for count in range(1, 1001)]
-    due = [count for count, step in enumerate(steps, 1) if graph_due(step)]
+    due = [count for count, step in enumerate(steps, 1) if all_due(step)]
     assert due[:99] == list(range(1, 100))  # every frame of a short run
     assert len(due) < 300
     assert max(np.diff(due[98:]) / due[99:]) <= 1 / 50  # never far behind
-    assert graph_due(replace(steps[-2], last=True))
+    assert all_due(replace(steps[-2], last=True))
+
+
+def test_between_those_times_no_model_is_made(run: list[Step], tmp_path: Path) -> None:
+    made: list[int] = []
+
+    def counted(count: int) -> None:
+        made.append(count)
+
+    view = run[0].views[0]
+    with closing(open_stream("long", save=tmp_path / "long.rrd")) as stream:
+        for count in range(100, 106):
+            views = dict.fromkeys(range(count), view)
+            stream(replace(run[1], views=views, make_model=partial(counted, count)))
+    assert made == [100, 102, 104]

@@ -35,7 +35,7 @@ def draw_model(step: Step) -> Drawing:
     if model is None or meshed:
         yield entities.CLOUD, CLEAR
     else:
-        stride = math.ceil(max(len(model.points_m), 1) / 15_000)  # recorded again at each step
+        stride = math.ceil(max(len(model.points_m), 1) / 15_000)  # recorded again and again
         normals = model.normals[::stride]
         colours = shaded(_PLAIN, normals) if model.colours is None else model.colours[::stride]
         yield entities.CLOUD, rr.Points3D(model.points_m[::stride], colors=colours, radii=POINT_SIZE)

@@ -112,15 +112,15 @@ def draw_readings(step: Step) -> Drawing:
             yield f"{reading}/pose", rr.Scalars(value)
 
 
-def draw_text(step: Step) -> Drawing:
-    """Yield the result of the frame in words, and a log line for each pair."""
+def draw_text(step: Step, *, with_model: bool = True) -> Drawing:
+    """Yield the result of the frame in words, and a log line for each pair; for `with_model` see `now_words`."""
     level = rr.TextLogLevel.INFO if step.accepted else rr.TextLogLevel.WARN
     if not step.edges and not step.last:
         yield entities.LOG, rr.TextLog(f"frame {step.frame.index}: {_outcome(step)}", level=level)
     for edge in step.edges:
         level = rr.TextLogLevel.INFO if edge.accepted else rr.TextLogLevel.WARN
         yield entities.LOG, rr.TextLog(pair_words(edge, step), level=level)
-    yield entities.NOW, rr.TextDocument(now_words(step), media_type=rr.MediaType.MARKDOWN)
+    yield entities.NOW, rr.TextDocument(now_words(step, with_model=with_model), media_type=rr.MediaType.MARKDOWN)
 
 
 def _outcome(step: Step) -> str:
@@ -139,8 +139,13 @@ def pair_words(edge: Edge, step: Step) -> str:
     return f"{edge.source} → {edge.target} {verdict}: {posterior.outcome.label}; {known}"
 
 
-def now_words(step: Step) -> str:
-    """Return in Markdown the outcome of the frame and of its pairs, and the state of the model."""
+def now_words(step: Step, *, with_model: bool = True) -> str:
+    """Return in Markdown the outcome of the frame and of its pairs, and the state of the run.
+
+    Args:
+        step: of the frame.
+        with_model: whether to say the size of the model, which is made for that.
+    """
     frame = f"Frame {step.frame.index}: {'accepted' if step.accepted else 'left out'}"
     lines = [f"### {frame}{', the last' if step.last else ''}"]
     for edge in step.edges:
@@ -158,13 +163,19 @@ def now_words(step: Step) -> str:
         lines.append(f"- {edge.source} → {edge.target} {edge.kind} is left out: the other edges contradict it.")
     lines += [f"- {words}." for words in loop_words(step)] if step.last else []
     rejected = len(step.edges_so_far) - len(kinds)
-    points = 0 if step.model is None else len(step.model.points_m)
     lines.append(
         f"\nSo far: views {len(step.views)}, odometry edges {kinds.count('odometry')}, spans {kinds.count('span')}, "
-        f"loop closures {kinds.count('closure')}, pairs rejected {rejected}; the model has {points:,} points"
-        + (f" and {len(step.model.triangles):,} triangles." if step.model is not None and step.last else ".")
+        f"loop closures {kinds.count('closure')}, pairs rejected {rejected}{_model_words(step) if with_model else ''}."
     )
     return "\n".join(lines)
+
+
+def _model_words(step: Step) -> str:
+    """Return the size of the model in words, to go on with."""
+    if step.model is None:
+        return "; the model has 0 points"
+    triangles = f" and {len(step.model.triangles):,} triangles" if step.last else ""
+    return f"; the model has {len(step.model.points_m):,} points{triangles}"
 
 
 def loop_words(step: Step) -> list[str]:

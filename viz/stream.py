@@ -12,6 +12,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -216,15 +217,20 @@ class RerunStream:
             pair_view.draw_posterior,
             images.draw_projected_points,
         )
-        of_model = (model_view.draw_model, model_view.draw_merged_clouds, graph_view.draw_newest_camera)
-        of_graph = (graph_view.draw_graph, graph_view.draw_uncertainty) if graph_due(step) else ()
+        of_all = (
+            model_view.draw_model,
+            model_view.draw_merged_clouds,
+            graph_view.draw_graph,
+            graph_view.draw_uncertainty,
+        )
+        due = all_due(step)
         repeated = step.last and shown_posterior(step) is None  # the last frame's pair stays in view
         unchanged = step.view is None and not step.last
         drawings = (
             *(() if repeated else of_pair),
-            *(() if unchanged else (*of_model, *of_graph)),
+            *(() if unchanged else (graph_view.draw_newest_camera, *(of_all if due else ()))),
             readings.draw_readings,
-            readings.draw_text,
+            partial(readings.draw_text, with_model=due),
         )
         self.draw(step, itertools.chain(*(drawing(step) for drawing in drawings)))
 
@@ -284,8 +290,11 @@ class RerunStream:
                 own.stop()
 
 
-def graph_due(step: Step) -> bool:
-    """Return whether the whole graph is to be drawn again: with every view, later with every second and so on."""
+def all_due(step: Step) -> bool:
+    """Return whether the model and the graph are to be drawn again: with every view, later with every second and so on.
+
+    So they cost a frame of thousands no more than one of hundreds.
+    """
     count = len(step.views)
     return step.last or count % max(1, count // 50) == 0
 
