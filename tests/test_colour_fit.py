@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
@@ -10,12 +11,12 @@ from scipy import ndimage
 from slow_cases import quick_first
 from tabletop import recoloured
 from test_inputs_plain_errors import colour_as
-from test_verdict import CAMERA, MIDDLE, poses_of, seen, turned, views_of, whole_run
+from test_verdict import AXES_M, CAMERA, MIDDLE, poses_of, seen, turned, views_of, whole_run
 
 from modeler import se3
 from modeler.kernels.photometric import displaced_correlations
 from modeler.types import FLIPS, Array, Flip, RayImage
-from modeler.verdict.colour_fit import Displacement, colour_fit
+from modeler.verdict.colour_fit import ColourFit, Comparison, Displacement
 
 ANGLES_DEG = [20.0 * k for k in range(8)]
 
@@ -33,14 +34,16 @@ def printed(
     noise: float = 1.0,
     above_deg: float = 0.0,
     angles_deg: tuple[float, ...] = tuple(ANGLES_DEG),
+    axes_m: tuple[float, ...] = tuple(AXES_M),
 ) -> dict[int, RayImage]:
     """Return views of an ellipsoid with a print, before a wall with a pattern of its own."""
     rng = np.random.default_rng(5)
-    views = {index: seen(index, from_above(angle_deg, above_deg)) for index, angle_deg in enumerate(angles_deg)}
+    poses = [from_above(angle_deg, above_deg) for angle_deg in angles_deg]
+    views = {index: seen(index, pose, axes_m=np.array(axes_m)) for index, pose in enumerate(poses)}
     waves, phases = rng.normal(scale=350.0, size=(20, 3)), rng.uniform(0.0, 2.0 * np.pi, 20)
     wall = 100.0 + 30.0 * ndimage.gaussian_filter(rng.normal(size=(CAMERA.height, CAMERA.width)), 2.0) / 0.14
     for index, view in views.items():
-        points_m = se3.transform(se3.inverse(from_above(angles_deg[index], above_deg)), view.points_m)
+        points_m = se3.transform(se3.inverse(poses[index]), view.points_m)
         image = wall.copy()
         image[view.pixels[:, 0], view.pixels[:, 1]] = 120.0 + 12.0 * contrast * np.sum(
             np.sin(points_m @ waves.T + phases), axis=1
@@ -54,6 +57,12 @@ def changed(views: dict[int, RayImage], **how: object) -> dict[int, RayImage]:
     """Return views with colour as another camera shows it."""
     given = {"mirrored": False, "scale": 1.0, "shift_px": (0.0, 0.0)} | how
     return {k: recoloured(view, colour_as(view.frame.colour, **given)) for k, view in views.items()}  # pyright: ignore[reportArgumentType]
+
+
+def colour_fit(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ColourFit:
+    compared = Comparison.of(views, trajectory)
+    assert compared is not None
+    return compared.fit()
 
 
 def test_aligned_colour_fits() -> None:
@@ -124,9 +133,9 @@ def test_a_pattern_that_stands_still_is_not_taken_for_print() -> None:
 
 
 def test_without_colour_or_shared_surface_nothing_is_said() -> None:
-    assert colour_fit(views_of(ANGLES_DEG), poses_of(ANGLES_DEG)) is None
+    assert Comparison.of(views_of(ANGLES_DEG), poses_of(ANGLES_DEG)) is None
     apart = [0.0, 90.0, 180.0]
-    assert colour_fit({k: printed()[k] for k in range(3)}, poses_of(apart)) is None
+    assert Comparison.of({k: printed()[k] for k in range(3)}, poses_of(apart)) is None
 
 
 def test_a_run_with_colour_of_another_camera_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -213,6 +213,20 @@ def test_contradicted_surface_is_coloured_in_its_frame_and_the_remedy_stated(run
     assert red[1] > 10.0 * max(red[0], red[2], 1e-5)
 
 
+def test_where_colour_is_against_depth_stands_at_the_head(run: Path, page: str, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    report = json.loads((folder / "report.json").read_text())
+    place = {"shift_px": [-0.8, 0.1], "shift_sigma_px": [0.2, 12.8], "scale": 0.998, "scale_sigma": 0.003}
+    report["colour"] = {**place, "flip": "", "frames": -1}
+    (folder / "report.json").write_text(json.dumps(report))
+    write_page(folder, folder / "page.html")
+    shown = (folder / "page.html").read_text(encoding="utf-8")
+    for words in ("-0.8 ± 0.2, 0.1 ± 12.8 px", "-0.2 ± 0.3 %", "colour is of the frame before"):
+        assert words in shown
+        assert words not in page
+
+
 def test_the_mask_of_every_frame_is_shown(run: Path, page: str) -> None:
     masks = page.partition("<h2>Masks</h2>")[2].partition("<h2>")[0]
     assert re.findall(r"<p>([^<]*)</p>", masks) == [f"{k}, left out" if k == LOST else str(k) for k in range(COUNT)]

@@ -15,6 +15,7 @@ import numpy as np
 from modeler import se3
 from modeler.types import (
     Array,
+    ColourAlignment,
     Edge,
     FrameRecord,
     OptimisationOutlier,
@@ -99,6 +100,7 @@ def report_of(step: Step, meta: RunMeta) -> dict[str, Any]:
         "reasons": verdict.reasons,
         "reason_codes": verdict.codes,
         "evidence": {name: {**asdict(check), "holds": check.holds} for name, check in verdict.checks.items()},
+        "colour": None if verdict.colour is None else _colour(verdict.colour),
         "contradicted": {
             str(frame): {
                 "size": views[frame].frame.depth_m.shape,
@@ -142,6 +144,20 @@ def _camera(
         "loops": focal.loops,
         "sigmas_before": focal.sigmas_before,
         "sigmas_after": focal.sigmas_after,
+    }
+
+
+def _colour(found: ColourAlignment) -> dict[str, Any]:
+    """Return where colour is against depth."""
+    scale, sigmas = math.exp(found.mean[2]), np.sqrt(np.diag(found.covariance))
+    return {
+        "shift_px": found.mean[:2],
+        "shift_sigma_px": sigmas[:2],
+        "scale": scale,
+        "scale_sigma": scale * sigmas[2],
+        "covariance": found.covariance.ravel(),
+        "flip": found.flip,
+        "frames": found.frames,
     }
 
 

@@ -99,11 +99,12 @@ def _registration() -> None:
 
 def _fusion() -> None:
     """Compare the colours of two frames of a bundled sequence, and fuse them."""
-    from modeler.verdict.colour_fit import colour_fit
+    from modeler.verdict.colour_fit import Comparison
 
     modeler, views, trajectory = _prepared()
     by_frame = {view.index: view for view in views}
-    colour_fit(by_frame, trajectory)
+    if (compared := Comparison.of(by_frame, trajectory)) is not None:
+        compared.fit()
     modeler.fuser.fuse(by_frame, trajectory)
 
 

@@ -21,6 +21,7 @@ from modeler.types.interfaces import AbstractRegistrar as AbstractRegistrar
 from modeler.types.interfaces import SharedAxis as SharedAxis
 from modeler.types.interfaces import ViewPair as ViewPair
 from modeler.types.model import Check as Check
+from modeler.types.model import ColourAlignment as ColourAlignment
 from modeler.types.model import Contradictions as Contradictions
 from modeler.types.model import Event as Event
 from modeler.types.model import FrameRecord as FrameRecord

@@ -14,7 +14,7 @@ from modeler.types.base import Array, Outcome
 from modeler.types.posteriors import Posterior
 from modeler.types.reasons import ACCEPTED, Reason, code, explain
 from modeler.types.solution import Edge, Solution
-from modeler.types.views import Frame, RayImage, Segmentation
+from modeler.types.views import Flip, Frame, RayImage, Segmentation
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +79,27 @@ class Contradictions:
     """(m, 2) row and column where it measured free space, and others surface."""
 
 
+@dataclass(frozen=True, eq=False)
+class ColourAlignment:
+    """Where colour is against depth, as far as print tells that several views see: a Gaussian."""
+
+    mean: Array
+    """(3,) shift right and down in px, and logarithm of the scale about the middle of the image."""
+    covariance: Array
+    """(3, 3); what print does not tell has the prior's."""
+    flip: Flip = ""
+    """How colour is turned over."""
+    frames: int = 0
+    """Number of frames by which the time of colour is after that of depth."""
+
+    def __str__(self) -> str:
+        (x, y, scale), (x_sd, y_sd, scale_sd) = self.mean, np.sqrt(np.diag(self.covariance))
+        return (
+            f"shift ({x:.1f} ± {x_sd:.1f}, {y:.1f} ± {y_sd:.1f}) px, scale {np.exp(scale):.3f} ± "
+            f"{np.exp(scale) * scale_sd:.3f}"
+        )
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether a model can be trusted."""
@@ -93,6 +114,8 @@ class Verdict:
     """Error of the surface above which a model is called wrong."""
     contradicted: Mapping[int, Contradictions] = field(default_factory=dict)
     """By number of a frame that contradicts others beyond a limit."""
+    colour: ColourAlignment | None = None
+    """Where colour is against depth; None where no views with colour share surface, or colour was not used."""
 
     @property
     def trustworthy(self) -> bool:

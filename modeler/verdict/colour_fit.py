@@ -7,7 +7,7 @@ against depth, or of another frame, it has not, and colours displaced accordingl
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 from weakref import WeakKeyDictionary
@@ -32,9 +32,9 @@ NEAR_DEG, FAR_DEG = MIN_TURN_DEG, GeneralPrior.max_rotation_deg  # rotation betw
 MIN_SHARED: Final = 60  # points of a pair: the sd of a chance correlation is then 0.13
 _MARGIN: Final = 4.0  # widths of the fine band: nearer to its outline, a feature is of the background
 _WIDTH: Final = 0.01  # of the object's extent in px: width of the fine band, at least a pixel
-_COARSE: Final = 2.0  # ratio of the widths of the two bands, and of the steps of the search to the finer one
-_REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: baselines of 15 to 50 mm at half a metre
-_LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
+COARSE: Final = 2.0  # ratio of the widths of the two bands, and of the steps of the search to the finer one
+REACH: Final = (0.12, 0.08)  # largest shifts searched, of the image's width: baselines of 15 to 50 mm at half a metre
+LOG_SCALES: Final = 0.07 * np.arange(-5, 6)  # fields of view of depth and colour differ by up to 1.4
 _OUTLINED: Final = 0.8  # of edges: measured 0.65 to 0.7 for plain bodies on a table, 0.98 to 1.5 for displaced colour
 AT_LEAST: Final = Thresholds.min_correlation
 """Of the correlation elsewhere, and of that one: less is found by chance on few points."""
@@ -58,6 +58,10 @@ class Displacement:
     def row(self) -> Array:
         """Return it (5,) for the kernel."""
         return np.array([self.scale, *self.shift_px, *FLIPS[self.flip]])
+
+    def moved_to(self, place: Array) -> Displacement:
+        """Return it with a shift in px, right and down, and a logarithm of the scale (3,)."""
+        return replace(self, scale=float(np.exp(place[2])), shift_px=(float(place[0]), float(place[1])))
 
     def moved(self, places: Array, shape: tuple[int, ...]) -> Array:
         """Return where places (n, 2) of depth, columns and rows, are in images of colour of a shape (h, w)."""
@@ -93,21 +97,6 @@ class ColourFit:
         return Check(min(share, 1.0), AT_LEAST, at_least=True)
 
 
-def colour_fit(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ColourFit | None:
-    """Return how colours of a run agree; None without pairs of views with colour that share surface.
-
-    Args:
-        views: by frame number.
-        trajectory: object_from_camera (4, 4) by frame number.
-    """
-    coloured = {frame: views[frame] for frame in sorted(trajectory) if frame in views and has_colour(views[frame])}
-    if len({view.frame.colour.shape for view in coloured.values() if view.frame.colour is not None}) != 1:
-        return None
-    pairs = [Pair.of(coloured, trajectory, *names) for names in _spread(coloured, trajectory)]
-    pairs = [pair for pair in pairs if len(pair.points_m) >= MIN_SHARED]
-    return Comparison(coloured, trajectory, tuple(pairs)).fit() if pairs else None
-
-
 def has_colour(view: RayImage) -> bool:
     """Return whether a view shows surface in colours that a camera measured."""
     return view.frame.colour is not None and not view.rendered and len(view.points_m) > 0
@@ -134,13 +123,18 @@ class Pair:
     """Frame number."""
     points_m: Array
     """(n, 3) in the object's frame."""
+    normals: tuple[Array, Array]
+    """(n, 3) each, there, as the first and the second view have them; NaN in holes of the first."""
+    pixels: int
+    """Number of pixels of the second view that they stand for."""
 
     @staticmethod
     def of(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], first: int, second: int) -> Pair:
         """Return the surface of the second view that the first one sees, too."""
         target, source = views[first], views[second]
         kept = np.flatnonzero(_inside(source, source.pixels))
-        kept = kept[:: max(len(kept) // SOME_POINTS, 1)]
+        stride = max(len(kept) // SOME_POINTS, 1)
+        kept = kept[::stride]
         target_from_source = se3.inverse(trajectory[first]) @ trajectory[second]
         points_m, normals = se3.transform(target_from_source, source.points_m[kept]), source.normals[kept]
         facing = -np.sum(points_m * (normals @ target_from_source[:3, :3].T), axis=1)
@@ -152,7 +146,12 @@ class Pair:
         near = np.abs(target.frame.depth_m[pixels[:, 0], pixels[:, 1]] - points_m[:, 2])
         matched = near < 4.0 * target.sigma_r_m + _WIDTH * target.size_m
         matched &= _inside(target, pixels)
-        return Pair(first, second, se3.transform(trajectory[second], source.points_m[kept[matched]]))
+        kept, numbers = kept[matched], target.numbers[tuple(pixels[matched].T)]
+        known = np.concatenate([target.normals, np.full((1, 3), np.nan)])[numbers]
+        normals = (known @ trajectory[first][:3, :3].T, source.normals[kept] @ trajectory[second][:3, :3].T)
+        return Pair(
+            first, second, se3.transform(trajectory[second], source.points_m[kept]), normals, stride * len(kept)
+        )
 
 
 def places_in(view: RayImage, points_m: Array) -> Array:
@@ -191,6 +190,21 @@ class Comparison:
     trajectory: Mapping[int, Array]
     pairs: Sequence[Pair]
 
+    @staticmethod
+    def of(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> Comparison | None:
+        """Return the comparison of a run; None without pairs of views with colour that share surface.
+
+        Args:
+            views: by frame number.
+            trajectory: object_from_camera (4, 4) by frame number.
+        """
+        coloured = {frame: views[frame] for frame in sorted(trajectory) if frame in views and has_colour(views[frame])}
+        if len({view.frame.colour.shape for view in coloured.values() if view.frame.colour is not None}) != 1:
+            return None
+        pairs = [Pair.of(coloured, trajectory, *names) for names in _spread(coloured, trajectory)]
+        pairs = [pair for pair in pairs if len(pair.points_m) >= MIN_SHARED]
+        return Comparison(coloured, trajectory, tuple(pairs)) if pairs else None
+
     def fit(self) -> ColourFit:
         """Return how colours agree, and the best displacement if they agree poorly where they are."""
         fine_px, here = self.width_px, Displacement()
@@ -206,7 +220,8 @@ class Comparison:
         return float(np.median([_width_px(view) for view in self.views.values()]))
 
     @cached_property
-    def _frames(self) -> list[int]:
+    def frames(self) -> list[int]:
+        """Numbers of the frames that are compared."""
         return sorted({frame for pair in self.pairs for frame in (pair.first, pair.second)})
 
     @cached_property
@@ -215,7 +230,7 @@ class Comparison:
 
     @cached_property
     def _indices(self) -> np.ndarray:
-        number = {frame: place for place, frame in enumerate(self._frames)}
+        number = {frame: place for place, frame in enumerate(self.frames)}
         return np.array([(number[pair.first], number[pair.second]) for pair in self.pairs])
 
     @cached_property
@@ -240,24 +255,26 @@ class Comparison:
     def features(self, width_px: float) -> np.ndarray:
         """Return those of all views that are compared (v, h, w)."""
         if width_px not in self._features:
-            self._features[width_px] = np.stack([self.feature(frame, width_px) for frame in self._frames])
+            self._features[width_px] = np.stack([self.feature(frame, width_px) for frame in self.frames])
         return self._features[width_px]
+
+    def camera_from_object(self, frame: int, frames: int) -> Array:
+        """Return where (4, 4) surface is in the colour of a view if that is of `frames` later; NaN where unknown."""
+        order = list(self.views)
+        place = order.index(frame) + frames
+        known = 0 <= place < len(order)
+        return se3.inverse(self.trajectory[order[place]]) if known else np.full((4, 4), np.nan)
 
     def places(self, frames: int) -> Array:
         """Return where surface is in the two views (n, 4) if colour is that of `frames` later; NaN where unknown."""
         if frames not in self._at_times:
-            order = list(self.views)
             parts = []
             for pair in self.pairs:
-                sides = []
-                for frame in (pair.first, pair.second):
-                    place = order.index(frame) + frames
-                    if not 0 <= place < len(order):
-                        sides.append(np.full((len(pair.points_m), 2), np.nan))
-                        continue
-                    camera_from_object = se3.inverse(self.trajectory[order[place]])
-                    sides.append(places_in(self.views[frame], se3.transform(camera_from_object, pair.points_m)))
-                parts.append(np.concatenate(sides, axis=1))
+                sides = [
+                    (self.views[frame], self.camera_from_object(frame, frames)) for frame in (pair.first, pair.second)
+                ]
+                places = [places_in(view, se3.transform(pose, pair.points_m)) for view, pose in sides]
+                parts.append(np.concatenate(places, axis=1))
             self._at_times[frames] = np.concatenate(parts)
         return self._at_times[frames]
 
@@ -280,7 +297,7 @@ class Comparison:
     def edges(self, displacement: Displacement) -> float:
         """Return how steep (0..1) colours are along the outline of surface under a displacement, on average."""
         order, found = list(self.views), []
-        for number, frame in enumerate(self._frames):
+        for number, frame in enumerate(self.frames):
             place = order.index(frame) + displacement.frames
             if 0 <= place < len(order):
                 surface = _surface(self.views[order[place]])
@@ -298,7 +315,7 @@ class Comparison:
 
     def _elsewhere(self, correlation: float) -> tuple[Displacement, float]:
         """Return the best displacement and its correlation; alignment if none is significantly better."""
-        fine_px, coarse_px, here = self.width_px, _COARSE * self.width_px, Displacement()
+        fine_px, coarse_px, here = self.width_px, COARSE * self.width_px, Displacement()
         grid = list(self._grid(coarse_px))
         scores = self.correlations(grid, coarse_px, stride=DESCENT_STRIDE).mean(axis=1)
         order = np.argsort(-scores, kind="stable")
@@ -318,16 +335,16 @@ class Comparison:
     def _grid(self, step_px: float) -> Iterator[Displacement]:
         """Yield displacements as far apart as the coarse band is wide."""
         width = self.features(step_px).shape[2]
-        across, down = (np.arange(-int(reach * width / step_px), int(reach * width / step_px) + 1) for reach in _REACH)
+        across, down = (np.arange(-int(reach * width / step_px), int(reach * width / step_px) + 1) for reach in REACH)
         for flip in FLIPS:
-            for log_scale in _LOG_SCALES:
+            for log_scale in LOG_SCALES:
                 for x in across:
                     for y in down:
                         yield Displacement(float(np.exp(log_scale)), (step_px * float(x), step_px * float(y)), flip)
 
     def _refined(self, start: Displacement) -> tuple[Displacement, float]:
         """Return the best displacement near one of the coarse search, in the fine band, and its correlation."""
-        best, step_px = start, _COARSE * self.width_px
+        best, step_px = start, COARSE * self.width_px
         half_px = 0.25 * self.features(self.width_px).shape[2]  # by which a scale moves most of what is seen, at most
         found = self.correlation(best, self.width_px)
         while step_px >= 0.5 * self.width_px:
@@ -339,7 +356,7 @@ class Comparison:
                     best.flip,
                 )
                 for x, y, s in steps
-                if abs(np.log(best.scale) + s * step_px / half_px) <= _LOG_SCALES[-1]
+                if abs(np.log(best.scale) + s * step_px / half_px) <= LOG_SCALES[-1]
             ]
             scores = self.correlations(near, self.width_px).mean(axis=1)
             top = int(np.argmax(scores))

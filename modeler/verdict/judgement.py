@@ -17,6 +17,7 @@ from modeler.types import (
     NEAR_DEG,
     AbstractPrior,
     Check,
+    ColourAlignment,
     Edge,
     Failed,
     FocalLength,
@@ -37,7 +38,8 @@ from modeler.types import (
     loops_closed,
     segments,
 )
-from modeler.verdict.colour_fit import colour_fit
+from modeler.verdict.colour_alignment import colour_alignment
+from modeler.verdict.colour_fit import Comparison
 from modeler.verdict.evidence import (
     MAX_UNSURE,
     FreeSpace,
@@ -99,7 +101,8 @@ def judged(
     reasons += [Shortcoming("left_out", words) for words in _left_out(frames, segments(edges))]
     free = free_space(step.views, step.solution.trajectory, tolerance_m) if step.last else None
     found = _found(step, frames, edges, prior, tolerance_m, free=free) if step.last else []
-    found += _colour(step) if step.last and colour else []
+    of_colour, alignment = _colour(step) if step.last and colour else ([], None)
+    found += of_colour
     found += _alike(step, edges, prior, tolerance_m, colour=colour) if step.last else []
     reasons += _against(found)
     spreads, open_loop = [], _open_loop(step, edges, closure_expected=closure_expected)
@@ -114,7 +117,7 @@ def judged(
         spreads += _size(step, depth_scale_sigma, tolerance_m)
     reasons += [*open_loop, *_unconfirmed_join(edges), *_against(spreads)]
     checks = {finding.name: finding.check for finding in (*found, *spreads)}
-    return Verdict(tuple(reasons), checks, tolerance_m, {} if free is None else free.contradictions)
+    return Verdict(tuple(reasons), checks, tolerance_m, {} if free is None else free.contradictions, alignment)
 
 
 @dataclass(frozen=True)
@@ -198,16 +201,18 @@ def _found(
     return found
 
 
-def _colour(step: Step) -> list[_Finding]:
-    """Return whether colour fits depth, if surface that two views see has colour."""
-    fit = colour_fit(step.views, step.solution.trajectory)
-    if fit is None:
-        return []
+def _colour(step: Step) -> tuple[list[_Finding], ColourAlignment | None]:
+    """Return whether colour fits depth, and where it is, if surface that two views see has colour."""
+    compared = Comparison.of(step.views, step.solution.trajectory)
+    if compared is None:
+        return [], None
+    fit = compared.fit()
+    alignment = colour_alignment(compared, fit.displacement)
     words = (
         "colour does not fit depth: its correlation on surface that two frames see is "
-        f"{fit.correlation:.2f}, and {fit.elsewhere:.2f} if it {fit.displacement}: is it aligned?"
+        f"{fit.correlation:.2f}, and {fit.elsewhere:.2f} if it {fit.displacement} ({alignment}): is it aligned?"
     )
-    return [_Finding("colour_fit", fit.check, "colour_misaligned", words)]
+    return [_Finding("colour_fit", fit.check, "colour_misaligned", words)], alignment
 
 
 def _alike(

@@ -90,6 +90,21 @@ def _focal_length(camera: Mapping[str, Any] | None) -> list[tuple[str, str, str]
     return [(value, "focal length, estimated from loops", why)]
 
 
+def _colour(colour: Mapping[str, Any] | None) -> list[tuple[str, str, str]]:
+    """Return where colour is against depth as key values; nothing where it is not known."""
+    if colour is None:
+        return []
+    across, down = (f"{px:.1f} ± {sd:.1f}" for px, sd in zip(colour["shift_px"], colour["shift_sigma_px"], strict=True))
+    how = [f"colour is {colour['flip']}"] if colour["flip"] else []
+    how += [f"colour is of the frame {'after' if colour['frames'] > 0 else 'before'}"] if colour["frames"] else []
+    why = "by print that several frames show; right and down, and a shift along the axis of all turns is not observable"
+    scale = f"{100.0 * (colour['scale'] - 1.0):.1f} ± {100.0 * colour['scale_sigma']:.1f} %"
+    return [
+        (f"{across}, {down} px", "shift of colour against depth", "; ".join([*how, why])),
+        (scale, "by how much colour shows things larger than depth", "about the middle of the image"),
+    ]
+
+
 def _head(result: Result, mesh: Mesh | None) -> str:
     """Return name, verdict and key figures."""
     report = result.report
@@ -111,6 +126,7 @@ def _head(result: Result, mesh: Mesh | None) -> str:
         ),
         *_loop_closure_error(report.get("loop")),
         *_focal_length(report.get("camera")),
+        *_colour(report.get("colour")),
         ("none" if mesh is None else f"{mesh.total:,}", "triangles", "of the fused mesh"),
         ("unknown" if total_s is None else f"{total_s:.0f} s", "build time", "reading and writing included"),
     ]
