@@ -63,13 +63,6 @@ def test_writing_again_what_was_read_gives_the_same_bytes(scene: Path, tmp_path:
             assert (scene / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
 
 
-def test_a_sequence_can_be_read_twice(scene: Path) -> None:
-    sequence = BopSequence(scene)
-    for first, second in zip(sequence, sequence, strict=True):
-        np.testing.assert_array_equal(first.depth_m, second.depth_m)
-    assert len(sequence) == len(list(sequence)) == 3
-
-
 def test_a_bare_scene_has_neither_truth_nor_mask_nor_colour(tmp_path: Path, frames: list[Frame]) -> None:
     bare = [Frame(f.index, f.time_s, f.depth_m, f.camera) for f in frames]
     write_bop(tmp_path / "bare", bare)

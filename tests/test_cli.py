@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,7 +19,6 @@ from command_runner import BOX, FILES, Run, refusal_of, spawned
 from modeler import priors, se3
 from modeler.baselines import fpfh
 from modeler.cli import main
-from modeler.cli.console import Interrupt
 from modeler.composition import compose
 from modeler.composition.compose import comes_back
 from modeler.composition.options import PriorOptions
@@ -319,7 +317,7 @@ def test_a_rendered_sequence_can_be_opened(cli: Run, tmp_path: Path) -> None:
     assert cli("render", path, "--out", tmp_path / "small").status == 2
 
 
-# What `build` remarks on at its end, and how Ctrl-C brings that about.
+# What `build` remarks on at its end.
 
 
 def test_a_step_between_numbers_that_leave_some_out_is_reported_as_a_step_between_frames() -> None:
@@ -409,18 +407,3 @@ def test_frames_without_a_hand_are_not_said_to_lack_the_object(hand: int, given:
     masks = [Outcome.UNSURE_MASK] * hand + [Outcome.CONVERGED] * (4 - hand)
     frames = [few, *({"cause": "", "mask": mask.label} for mask in masks)]
     assert bool(visible_frames([frame | {"id": place} for place, frame in enumerate(frames)])) is given
-
-
-@pytest.mark.parametrize(("count", "seen", "early"), [(5, [0, 1], True), (2, [0, 1], False)])
-def test_ctrl_c_ends_the_frames_and_a_second_one_the_program(count: int, seen: list[int], early: bool) -> None:
-    """After the last frame the first one changes nothing."""
-    before, taken = signal.getsignal(signal.SIGINT), list[int]()
-    with Interrupt() as interrupt:
-        for item in interrupt.until(range(count)):
-            taken.append(item)
-            if item == 1:
-                signal.raise_signal(signal.SIGINT)
-        assert (taken, interrupt.ended_early) == (seen, early)
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before

@@ -151,14 +151,6 @@ def test_it_ends_when_asked(tmp_path: Path, frames: list[Frame]) -> None:
     assert taken == [0, 1]
 
 
-def test_an_ordinary_sequence_is_not_live(tmp_path: Path, frames: list[Frame]) -> None:
-    write_bop(tmp_path / "s", frames)
-    sequence = open_sequence(tmp_path / "s")
-    assert isinstance(sequence, BopSequence)
-    assert not sequence.live
-    assert sequence.until(lambda: True) is sequence
-
-
 def test_nothing_or_nothing_readable_is_one_line(tmp_path: Path, frames: list[Frame]) -> None:
     brief = WatchLimits(idle_s=0.3, settle_s=0.05, first=2)
     with pytest.raises(InputError, match="no such folder"):

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-import rerun.blueprint as rrb
 from rerun_recordings import read
 from rich.console import Console as Terminal
 
@@ -22,7 +21,7 @@ from modeler.sequences import bundled, open_sequence
 from modeler.suggestion import Belief, Candidate, Suggestions, suggest
 from modeler.types import Failed, Outcome, Step
 from modeler.views import Sensor
-from modeler.viz import blueprint, model_view
+from modeler.viz import model_view
 from modeler.viz.stream import open_stream
 
 
@@ -146,15 +145,6 @@ def test_the_recording_holds_what_to_do_next_at_its_frame(modeler: Modeler, step
     recording = read(tmp_path / "r.rrd")
     assert found.ranked[0].words in recording[model_view.WORDS][step.frame.index]["text"][0]
     assert step.frame.index in recording[model_view.SEEN_CELLS]
-
-
-def test_a_run_that_is_advised_has_a_tab_for_it(steps: list[Step]) -> None:
-    for first in (None, steps[0].view):
-        plain, advised = blueprint.layout(first).root_container, blueprint.layout(first, (model_view.next_tab(first),))
-        assert isinstance(plain, rrb.Tabs)
-        assert isinstance(advised.root_container, rrb.Tabs)
-        assert len(list(advised.root_container.contents)) == len(list(plain.contents)) + 1
-        assert advised.root_container.active_tab == 0
 
 
 def test_where_nothing_can_be_done_nothing_is_to_be_gained(modeler: Modeler, steps: list[Step]) -> None:

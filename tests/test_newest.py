@@ -145,8 +145,10 @@ def test_images_of_waiting_frames_go_to_disk_once_memory_is_full() -> None:
 
 
 def test_ctrl_c_ends_reading_and_a_second_one_filling_in(capsys) -> None:
-    def pressing(after: int) -> Iterator[int]:
-        for number in range(10):
+    before = signal.getsignal(signal.SIGINT)
+
+    def pressing(after: int, count: int = 10) -> Iterator[int]:
+        for number in range(count):
             yield number
             if number == after:
                 os.kill(os.getpid(), signal.SIGINT)
@@ -159,6 +161,10 @@ def test_ctrl_c_ends_reading_and_a_second_one_filling_in(capsys) -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert "finishing" in capsys.readouterr().err
+    with Interrupt() as interrupt:  # after the last one it changes nothing
+        assert list(interrupt.until(pressing(1, 2))) == [0, 1]
+        assert not interrupt.ended_early
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_frame_without_the_object_leaves_some_hundred_bytes() -> None:
