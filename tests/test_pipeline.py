@@ -52,7 +52,7 @@ COLOURED = [view.frame for view in tabletop.views(BOX, POSES, np.random.default_
 FRAMES = [replace(frame, colour=None) for frame in COLOURED]
 """Without colours, of which the oracle makes nothing: they take half of the time of a run, to be fused and judged."""
 SIGMAS = np.repeat([0.002, 0.0005], 3)
-CLOSER = Closer(max_span_deg=85.0, thresholds=Thresholds(min_overlap=0.2))
+CLOSER = Closer(max_span_deg=85.0, min_span_gain_nats=0.0, thresholds=Thresholds(min_overlap=0.2))
 """It closes over two steps of the turntable too."""
 
 

@@ -62,6 +62,8 @@ class Closer:
     """Largest number of further views to register each frame against once all are in; 0 = none."""
     max_span_deg: float = 55.0
     """Largest rotation in degrees to such a view: two steps of the usual 25°."""
+    min_span_gain_nats: float = 0.1
+    """Least expected information gain of such an edge: that of one over two steps of 25°."""
     max_relocations: int = 4
     """Largest number of earlier views to register a frame against that the previous view does not place."""
     thresholds: Thresholds = field(default_factory=Thresholds)
@@ -138,7 +140,7 @@ class Closer:
                 map_view, source, pose, systematic, self.max_span_deg, has_own_edge=False, power=_SPAN_POWER
             )
             near = [k for k in np.flatnonzero(angle_deg <= self.max_span_deg) if {source, earlier[k]} not in tried]
-            found = gain.candidates([earlier[k] for k in near], angle_deg[near])
+            found = gain.candidates([earlier[k] for k in near], angle_deg[near], self.min_span_gain_nats)
             chosen = [one.frame for one in found if one.overlap >= self.thresholds.min_overlap]
             chosen = [frame for frame in earlier[-1:] if {source, frame} in failed] + chosen
             untried = source in ends and len(earlier) > 0 and {source, earlier[0]} not in tried

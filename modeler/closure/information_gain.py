@@ -68,7 +68,7 @@ class InformationGain:
         sigma_deg = np.maximum(np.degrees(np.sqrt(variance_rad2 + own_rad2)), 1e-6)
         return np.where(np.isinf(variance_rad2), 0.0, ndtr((self.max_angle_deg - angle_deg) / sigma_deg))
 
-    def candidates(self, frames: Sequence[int], angle_deg: Array, min_gain_nats: float = 0.0) -> list[Candidate]:
+    def candidates(self, frames: Sequence[int], angle_deg: Array, min_gain_nats: float) -> list[Candidate]:
         """Return the most informative of some earlier views, largest gain first.
 
         The shortest path bounds the covariance of the motion, so that the covariance itself is computed for only a few
@@ -77,7 +77,7 @@ class InformationGain:
         Args:
             frames: numbers of earlier views.
             angle_deg: (n,) predicted rotations to the new view.
-            min_gain_nats: views of no more gain are left out.
+            min_gain_nats: views of less gain are left out.
         """
         one_edge = self._one_edge
         if one_edge is None:
@@ -94,13 +94,13 @@ class InformationGain:
         bound_nats = 3.0 * found * np.log1p(relative_information * ratio)
         order = np.lexsort((np.array(frames), bound_nats))[::-1]
         candidates = []
-        for k in order[bound_nats[order] > min_gain_nats][:_MAX_EXACT]:
+        for k in order[bound_nats[order] >= min_gain_nats][:_MAX_EXACT]:
             overlap = self._overlap(frames[k])
             covariance = self.map_view.solution.relative_covariance(frames[k], self.previous)
             covariance = covariance + float(self.has_own_edge) * one_edge + float(length[k]) * self.systematic
             ratios = overlap * relative_information[k] * np.linalg.solve(scale[k] * one_edge, covariance)
             gain_nats = 0.5 * float(found[k] * np.linalg.slogdet(np.eye(6) + ratios)[1])  # method, eq. 9.1
-            if gain_nats > min_gain_nats:
+            if gain_nats >= min_gain_nats:
                 candidates.append(Candidate(frames[k], float(angle_deg[k]), overlap, gain_nats))
         return sorted(candidates, key=lambda candidate: -candidate.gain_nats)
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.special import ndtri
 
 from modeler.kernels import bands, photometric, scores
 from modeler.kernels.photometric import Colours, harmonics_of, shading_of
@@ -32,6 +31,7 @@ LOGS = (np.log(np.arange(256) + 4.0) / 3.0).astype(np.float32)
 """Third of the logarithm (256,) of each 8-bit value, for three channels; below 4, noise and rounding would dominate."""
 _COARSEST_ALIGNMENT = 2  # band in which images are first aligned: a tin's print moves by more than its width
 _SHADING_POINTS = 2000  # of a view, to estimate its shading
+_NORMAL_QUARTILE = 0.6745  # median magnitude of a standard normal variable
 _LEVEL = 1.0 / 255.0  # smallest change of a bright colour's logarithm in 8 bits
 _CACHE: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # of `view_features`
 
@@ -379,7 +379,7 @@ def _unshaded(layers: np.ndarray, surface: np.ndarray) -> np.ndarray:
     colours, shading = layers
     inside = np.flatnonzero(surface)
     changes = np.abs(shading.ravel()[inside[_subset(len(inside))]])
-    noise = max(float(np.median(changes) / ndtri(0.75)), _LEVEL)  # as of normal variables
+    noise = max(float(np.median(changes)) / _NORMAL_QUARTILE, _LEVEL)
     valid = np.empty(surface.shape, dtype=np.bool_)
     bands.subtract_shading(colours, shading, surface, np.float32(_LEVEL**2), np.float32(SIGMAS * noise), valid)
     return valid
