@@ -18,14 +18,14 @@ MOST = 0.5  # the majority of pixels, frames or a rim; half of a flat object's h
 MOSTLY = 0.7  # of the measurements at a static pixel agree; of the frames show the object alone, or an arm in place
 NEARLY_ALL = 0.98  # of an object is in front of a wall, and above its support
 FEW = 0.1  # of a mask's width on the image's edge truncate it; of a pile stand on its lid; are below a support
-LEAST_PIECE = 0.07  # of the largest: noise along edges, and false depth around limbs, have pieces of up to 6 %
+LEAST_PIECE = FEW  # of the largest: noise along edges, and false depth around limbs, have pieces of up to 6 %
 STRAY_WEIGHT = FEW  # of pieces that extend from the image's edge, as arms and people do, or lie outside the zone
 LEAST_PIXELS = 100  # of an object, or of a plane: fewer tell little of their shape
 HARDLY = 0.01  # share of measurements in a blind band, and at the edge of an image that shows an object alone
 _PLANNING_WIDTH_PX = 320  # images are downsampled to about this width for planning
-_APART_PX = 4  # of the downsampled image: blocks that stereo matches are as wide
+CELL_PX = 5  # of the downsampled image: blocks that stereo matches are about as wide
 _OUTLIERS_IN = 7  # one measurement in this many may be false; where more lie before the background, something moved
-_RIM_SHARE = 0.05  # of the image's width: wide enough for second differences of pixels that are `_APART_PX` apart
+_RIM_SHARE = 0.05  # of the image's width: wide enough for second differences of pixels that are `CELL_PX` apart
 _FREE_RIM = 0.4  # share of the rim that a near object and the arm that holds it leave free
 _FEW_FRAMES = 4  # with more frames, evidence from a single frame is ignored
 Labels = npt.NDArray[np.int32]
@@ -181,9 +181,7 @@ def noise_within(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthN
     stride, ratios = planning_stride(camera), []
     for whole_m in depths_m:
         depth_m = whole_m[::stride, ::stride]
-        left, middle, right = (
-            depth_m[:, k : depth_m.shape[1] - 2 * _APART_PX + k] for k in (0, _APART_PX, 2 * _APART_PX)
-        )
+        left, middle, right = (depth_m[:, k : depth_m.shape[1] - 2 * CELL_PX + k] for k in (0, CELL_PX, 2 * CELL_PX))
         bent = np.abs(left - 2.0 * middle + right) / noise.sigma_m(middle)
         ratios.append(bent[np.isfinite(bent)])
     bent = np.concatenate(ratios)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from modeler.segmentation.depth_images import FEW, LEAST_PIXELS, MOSTLY, NEARLY_ALL, DepthNoise
+from modeler.segmentation.depth_images import CELL_PX, FEW, LEAST_PIXELS, MOSTLY, NEARLY_ALL, DepthNoise
 from modeler.significance import SIGMAS
 from modeler.types import Array, BoolArray, Float32Array, Plane
 
@@ -19,7 +19,6 @@ Real = TypeVar("Real", bound=np.floating[Any])
 _SYSTEMATIC_TILT_RAD = 0.005
 _SYSTEMATIC_SHARE = 0.0015  # error of the plane's distance that its residuals do not show, and of the depth's scale
 _BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
-_CELL_PX = 5
 _MAX_HYPOTHESES = 200
 _MOST_PLANES = 10
 LEAST_SHARE: Final = 0.006
@@ -329,11 +328,11 @@ def _largest(cells: _Cells, free: BoolArray, level: Array | None) -> Array:
 
 def _flat_cells(points: Float32Array, noise: DepthNoise) -> _Cells:
     """Return the flat cells of an image of points (h, w, 3)."""
-    rows, columns = points.shape[0] // _CELL_PX, points.shape[1] // _CELL_PX
-    block = points[: rows * _CELL_PX, : columns * _CELL_PX].reshape(rows, _CELL_PX, columns, _CELL_PX, 3)
-    block = block.swapaxes(1, 2).reshape(rows * columns, _CELL_PX**2, 3)
+    rows, columns = points.shape[0] // CELL_PX, points.shape[1] // CELL_PX
+    block = points[: rows * CELL_PX, : columns * CELL_PX].reshape(rows, CELL_PX, columns, CELL_PX, 3)
+    block = block.swapaxes(1, 2).reshape(rows * columns, CELL_PX**2, 3)
     finite = np.isfinite(block[..., 2])
-    kept = finite.sum(axis=1) >= MOSTLY * _CELL_PX**2
+    kept = finite.sum(axis=1) >= MOSTLY * CELL_PX**2
     block, finite = block[kept].astype(np.float64), finite[kept]
     count = finite.sum(axis=1).astype(np.float64)
     block[~finite] = 0.0

@@ -44,7 +44,6 @@ from modeler.views.range_noise import RangeNoise
 
 _NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
 RIVAL = 0.3  # ratio of the score of what else may be the object from which it is ambiguous: 0.4 chooses of two alike
-_WALL_BORDER_SHARE = 0.03  # share of the image's edge on a plane that extends beyond the image
 _TOUCHING_PX = 3
 
 
@@ -229,7 +228,7 @@ def _beyond_image(planes: Array, rim: Float32Array, noise: DepthNoise) -> BoolAr
     tolerance_m, free, beyond = noise.tolerance_m(rim[:, 2]), np.ones(len(rim), dtype=np.bool_), []
     for plane in planes:
         on = free & (np.abs(heights(rim, plane)) < tolerance_m)
-        beyond.append(np.count_nonzero(on) > _WALL_BORDER_SHARE * len(rim))
+        beyond.append(np.count_nonzero(on) > FEW * len(rim))
         free &= ~on | (not beyond[-1])
     return np.array(beyond, dtype=np.bool_)
 
