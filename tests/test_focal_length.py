@@ -25,7 +25,6 @@ from modeler.sequences import FocalFactor, RefocusedSequence, bundled, open_sequ
 from modeler.types import (
     AbstractPoseDensity,
     Array,
-    Camera,
     Edge,
     FocalLength,
     Frame,
@@ -37,6 +36,7 @@ from modeler.types import (
 )
 from modeler.verdict.spreads import widened
 from modeler.views import Sensor
+from modeler.views.rays import part_of
 
 
 def test_a_posterior_states_how_its_mean_follows_the_focal_length() -> None:
@@ -262,9 +262,7 @@ def test_covariances_are_those_of_a_graph_with_the_focal_length_as_a_variable(rn
 
 
 def _small(frame: Frame) -> Frame:
-    camera, mask = frame.camera, frame.mask
-    small = Camera(160, 120, camera.fx / 4, camera.fy / 4, camera.cx / 4, camera.cy / 4)
-    return replace(frame, depth_m=frame.depth_m[::4, ::4].copy(), camera=small, mask=mask[::4, ::4], colour=None)
+    return replace(part_of(frame, slice(None, None, 4), slice(None, None, 4)), colour=None)
 
 
 @cache

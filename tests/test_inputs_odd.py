@@ -14,7 +14,8 @@ from command_runner import QUICK
 from modeler import se3
 from modeler.cli import main
 from modeler.sequences import bundled, open_sequence, write_bop
-from modeler.types import Camera, Frame, Outcome
+from modeler.types import Frame, Outcome
+from modeler.views.rays import part_of
 from studies.formats.image_folders import small_frames, small_truth
 from studies.fuzz.targets import tiny
 
@@ -52,9 +53,7 @@ def filled(frame: Frame) -> Frame:
     assert frame.mask is not None
     rows, columns = np.nonzero(frame.mask)
     top, left = int(np.percentile(rows, 30)), int(np.percentile(columns, 30))
-    cut = slice(top, top + 24), slice(left, left + 24)
-    camera = Camera(24, 24, frame.camera.fx, frame.camera.fy, frame.camera.cx - left, frame.camera.cy - top)
-    return replace(frame, depth_m=frame.depth_m[cut], mask=None, colour=frame.colour[cut], camera=camera)
+    return part_of(replace(frame, mask=None), slice(top, top + 24), slice(left, left + 24))
 
 
 def doubled(frame: Frame) -> Frame:
@@ -119,9 +118,7 @@ def test_an_object_that_fills_the_image_is_modelled_where_masks_say_so(frames: l
 
 def thinned(frame: Frame, step: int) -> Frame:
     """Return every so many-th pixel of a frame."""
-    old, kept = frame.camera, (slice(None, None, step), slice(None, None, step))
-    camera = Camera(old.width // step, old.height // step, old.fx / step, old.fy / step, old.cx / step, old.cy / step)
-    return replace(frame, depth_m=frame.depth_m[kept], mask=frame.mask[kept], colour=frame.colour[kept], camera=camera)
+    return part_of(frame, slice(None, None, step), slice(None, None, step))
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from modeler.sequences import Overrides, Survey, bundled, open_sequence, survey,
 from modeler.sequences.calibrated import AxialSequence, stretch
 from modeler.sequences.ros.messages import from_rvl
 from modeler.types import Camera, Frame, InputError
+from modeler.views.rays import part_of
 from studies.formats.image_folders import raw_depth, save
 
 CAMERA = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
@@ -100,12 +101,9 @@ def doubts_of(folder: Path, *, noise: float = 0.0, from_column: int = 0) -> list
     """Return the doubts of `info` about the bundled box, with more noise, or seen from some column of the images on."""
     rng, frames = np.random.default_rng(0), []
     for frame in open_sequence(bundled("box")):
-        depth_m = frame.depth_m[::2, from_column::2]  # half the size
-        depth_m = depth_m * (1.0 + noise * rng.standard_normal(depth_m.shape).astype(np.float32))
-        height, width = depth_m.shape
-        fx, fy, cx, cy = (0.5 * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
-        camera = Camera(width, height, fx, fy, cx - 0.5 * from_column, cy)
-        frames.append(Frame(frame.index, frame.time_s, depth_m.astype(np.float32), camera, None, None))
+        half = part_of(replace(frame, mask=None, colour=None), slice(None, None, 2), slice(from_column, None, 2))
+        scatter = 1.0 + noise * rng.standard_normal(half.depth_m.shape).astype(np.float32)
+        frames.append(replace(half, depth_m=(half.depth_m * scatter).astype(np.float32)))
     write_bop(folder, frames)
     sequence = open_sequence(folder)
     return [*survey(sequence).doubts, *of_the_scene(sequence)]

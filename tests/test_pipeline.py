@@ -45,6 +45,7 @@ from modeler.types import (
     explain,
 )
 from modeler.views import Sensor
+from modeler.views.rays import part_of
 
 BOX = tabletop.Box((0.06, 0.045, 0.08))
 POSES = tabletop.turntable(9)
@@ -484,22 +485,9 @@ def test_what_is_kept_of_a_frame_is_light_and_makes_the_same_view_again() -> Non
         np.testing.assert_array_equal(again.layers[name], layer)
 
 
-def _resized(frame: Frame, rows: slice, columns: slice) -> Frame:
-    camera = replace(
-        frame.camera,
-        width=columns.stop - columns.start,
-        height=rows.stop - rows.start,
-        cx=frame.camera.cx - columns.start,
-        cy=frame.camera.cy - rows.start,
-    )
-    window = (rows, columns)
-    images = {name: getattr(frame, name)[window] for name in ("depth_m", "mask", "colour")}
-    return replace(frame, **images, camera=camera)
-
-
 def test_frames_of_different_size_make_one_model() -> None:
     height, width = FRAMES[0].depth_m.shape
-    cut = [_resized(frame, slice(k, height), slice(0, width - 2 * k)) for k, frame in enumerate(COLOURED[:4])]
+    cut = [part_of(frame, slice(k, height), slice(0, width - 2 * k)) for k, frame in enumerate(COLOURED[:4])]
     last = run(cut)[-1]
     assert list(last.solution.trajectory) == [0, 1, 2, 3]
     assert len(last.model.triangles) > 0

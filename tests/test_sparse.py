@@ -18,7 +18,7 @@ from modeler.segmentation import Scene
 from modeler.sequences.rendering import RenderedSequence
 from modeler.types import Camera, Frame, Outcome, SensorNoise, Step
 from modeler.views import Sensor
-from modeler.views.rays import closed, gap_px, measured_share, nearest_depth
+from modeler.views.rays import closed, gap_px, measured_share, nearest_depth, part_of
 from studies.calibration.specimens import load_specimen
 from studies.calibration.study import Condition, staged
 
@@ -131,9 +131,11 @@ def test_sparse_views_are_registered_as_well_as_they_state(drill, share, worst_d
 
 def test_a_small_object_is_registered_by_a_hundred_pixels(drill):
     indices, (sigma_wh, sigma_r_m, *_) = drill.indices[:2], drill.sensor()
-    found = segmented([drill.frame(index) for index in indices])
+    found, sixth = segmented([drill.frame(index) for index in indices]), slice(None, None, 6)
     target, source = (
-        Sensor(SensorNoise(sigma_wh, sigma_r_m)).ray_image(coarse(drill.frame(index), 6), segmentation.plane)
+        Sensor(SensorNoise(sigma_wh, sigma_r_m)).ray_image(
+            part_of(drill.frame(index), sixth, sixth), segmentation.plane
+        )
         for index, segmentation in zip(indices, found, strict=True)
     )
     density = TablePrior().between(source, target)
@@ -141,18 +143,6 @@ def test_a_small_object_is_registered_by_a_hundred_pixels(drill):
     assert np.count_nonzero(source.frame.mask & np.isfinite(source.frame.depth_m)) < 130
     assert posterior.outcome is not Outcome.TOO_FEW_POINTS
     assert nees(posterior.pose, true_motion(drill.truth(), *indices)) < chi2.ppf(0.999, 6)
-
-
-def coarse(frame, step):
-    """Return a frame of every so many rows and columns."""
-    camera = frame.camera
-    smaller = Camera(
-        -(-camera.width // step),
-        -(-camera.height // step),
-        *(value / step for value in (camera.fx, camera.fy, camera.cx, camera.cy)),
-    )
-    depth_m, mask = (np.ascontiguousarray(image[::step, ::step]) for image in (frame.depth_m, frame.mask))
-    return replace(frame, depth_m=depth_m, mask=mask, camera=smaller)
 
 
 def test_sparse_frames_make_a_model(drill, rng):
