@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +16,10 @@ from test_inputs_plain_errors import colour_as
 from test_verdict import AXES_M, CAMERA, MIDDLE, poses_of, seen, turned, views_of, whole_run
 
 from modeler import se3
+from modeler.export import RunMeta, report_of
 from modeler.kernels.photometric import displaced_correlations
-from modeler.types import FLIPS, Array, Flip, RayImage
+from modeler.types import FLIPS, Array, Flip, RayImage, Step, Verdict
+from modeler.verdict import judged
 from modeler.verdict.colour_fit import ColourFit, Comparison, Displacement
 
 ANGLES_DEG = [20.0 * k for k in range(8)]
@@ -139,11 +143,26 @@ def test_without_colour_or_shared_surface_nothing_is_said() -> None:
 
 
 def test_a_run_with_colour_of_another_camera_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report says where its colour is."""
+    reports = []
+
+    def reported(step: Step, **given: Any) -> Verdict:
+        verdict = judged(step, **given)
+        reports.append(report_of(replace(step, verdict=verdict), RunMeta("run", 0, "table")))
+        return verdict
+
     views = changed(printed(), shift_px=(10.0, 0.0))
     monkeypatch.setattr("test_verdict.views_of", lambda angles_deg: {k: views[k] for k in range(len(angles_deg))})
+    monkeypatch.setattr("test_verdict.judged", reported)
     codes, holds = whole_run(ANGLES_DEG)
     assert "colour_misaligned" in codes
     assert holds["colour_fit"] is False
+    found = reports[0]["colour"]
+    assert found["shift_px"][0] == pytest.approx(10.0, abs=3.0 * found["shift_sigma_px"][0])
+    assert found["scale"] == pytest.approx(1.0, abs=3.0 * found["scale_sigma"])
+    assert max(found["shift_sigma_px"]) < 0.5
+    assert (found["flip"], found["frames"], len(found["covariance"])) == ("", 0, 9)
+    assert "(shift (" in reports[0]["reasons"][reports[0]["reason_codes"].index("colour_misaligned")]
 
 
 def test_correlations_are_those_of_interpolated_values(rng: np.random.Generator) -> None:
