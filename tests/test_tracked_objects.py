@@ -187,13 +187,17 @@ def test_a_frame_is_thinned_to_pixels_of_the_same_rays() -> None:
         assert sensor.noise.sigma_colour_px == Sensor().noise.sigma_colour_px / step
 
 
-def test_a_part_of_a_frame_has_pixels_of_the_same_rays() -> None:
+def test_a_part_of_a_frame_has_pixels_of_the_same_rays(rng: np.random.Generator) -> None:
     frame = rendered("boot")[0].frame(0)
-    rows, columns = slice(40, 90), slice(7, 140)
-    part = part_of(frame, rows, columns)
-    for seen, whole in zip(part.camera.rays(), frame.camera.rays(), strict=True):
-        assert np.allclose(seen, whole[rows, columns])
-    assert np.array_equal(part.depth_m, frame.depth_m[rows, columns], equal_nan=True)
+    mask, occluder, *colour = rng.integers(0, 256, (5, *frame.depth_m.shape)).astype(np.uint8)
+    frame = replace(frame, mask=mask < 128, occluder=occluder < 128, colour=np.stack(colour, axis=-1))
+    for step in (1, 3):
+        rows, columns = slice(40, 90, step), slice(7, 140, step)
+        part = part_of(frame, rows, columns)
+        for seen, whole in zip(part.camera.rays(), frame.camera.rays(), strict=True):
+            assert np.allclose(seen, whole[rows, columns])
+        for image in ("depth_m", "mask", "colour", "occluder"):
+            np.testing.assert_array_equal(getattr(part, image), getattr(frame, image)[rows, columns])
 
 
 def test_a_view_of_the_model_serves_wherever_the_object_is_shifted_or_turned_about_the_line_of_sight() -> None:
