@@ -144,6 +144,7 @@ WEAK_PASSES = 40  # of smoothing weak vertices
 PASSES = 60  # of fitting vertices to normals, and of smoothing unseen ones: with half as many, a box is 0.2 % larger
 PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxels
 EDGE = 4.685  # sd of the differences between neighbouring normals that make an edge: Tukey's, of 95 % efficiency
+FLATTENING_PASSES = 50  # at most, of the smoothing that shows how smoothed views flatten surface
 GUIDE_PASSES = 10  # of smoothing normals before edges are sought
 DIFFUSION_PASSES = 200  # of normals over neighbouring triangles: some 15 triangles far
 
@@ -362,7 +363,7 @@ def flattened_m(vertices_m: Array, triangles: Triangles, normals: Array, moment_
     corners = vertices_m[triangles]
     edge_m2 = float(np.mean(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2)))
     # The mean over a ring of radius r has a variance of r²/2 along either axis; half a step towards it, r²/4.
-    passes = min(int(np.ceil(moment_m2 / (0.25 * edge_m2))), PASSES)
+    passes = min(int(np.ceil(moment_m2 / (0.25 * edge_m2))), FLATTENING_PASSES)
     reached_m2 = passes * 0.25 * edge_m2
     step, scale = 0.5 * min(moment_m2 / reached_m2, 1.0), max(moment_m2 / reached_m2, 1.0)
     mean = _means(_neighbours(triangles), len(vertices_m))
