@@ -10,9 +10,9 @@ import re
 import pytest
 from command_runner import Run, spawned
 
-import modeler.cli
 from modeler import priors
 from modeler.cli import main, parsed
+from modeler.cli.overview import SUMMARIES, command_class
 from modeler.composition.options import PriorOptions
 
 COMMANDS = (
@@ -40,8 +40,12 @@ def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tell
     assert "Ctrl-C" not in overall
 
 
-def test_the_commands_are_those_that_are_promised() -> None:
-    assert set(modeler.cli.COMMANDS) == set(COMMANDS)
+def test_help_of_the_program_has_the_first_sentence_of_each_command_without_importing_it() -> None:
+    assert set(SUMMARIES) == set(COMMANDS)
+    for name, told in SUMMARIES.items():
+        assert " ".join((command_class(name).__doc__ or "").split("\n\n")[0].split()) == told
+    script = "import atexit, sys; atexit.register(lambda: print('tyro' in sys.modules)); import modeler.cli as cli; "
+    assert spawned("-c", f"{script} cli.main(['--help'])").out.endswith("False\n")
 
 
 def test_help_may_be_asked_for_in_a_word(cli: Run) -> None:
@@ -88,9 +92,9 @@ def test_help_imports_nothing_heavy() -> None:
     script = f"""
 import contextlib, sys
 from modeler.cli import main
-for words in ([], *([command] for command in {COMMANDS})):
+for command in {COMMANDS}:
     with contextlib.suppress(SystemExit):
-        main([*words, "--help"])
+        main([command, "--help"])
 sys.exit(", ".join(sorted(set({heavy}) & set(sys.modules))) or None)
 """
     ended = spawned("-c", script)

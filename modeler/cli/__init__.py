@@ -4,8 +4,6 @@ Each command is a frozen dataclass whose fields are its options; `run` returns t
 where options, input or output cannot be used. Heavy imports are inside functions, so that help appears at once.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import gc
@@ -17,9 +15,7 @@ import os
 import re
 import resource
 import shlex
-import shutil
 import sys
-import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
@@ -28,10 +24,11 @@ from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Final, Protocol
+from typing import Any
 
 from modeler.cli import messages
 from modeler.cli.console import INTERRUPTED, endable, say, worded_as_options
+from modeler.cli.overview import SUMMARIES, Command, command_class, overview
 from modeler.system.processes import check_room, share_one_heap
 
 complain = partial(say, level=logging.ERROR)
@@ -108,7 +105,7 @@ def parsed(arguments: Sequence[str]) -> Command:
     """
     name, *others = messages.split(arguments)[1] or ("",)
     if name == "help":
-        name, others = (others[0], ["--help"]) if others[:1] and others[0] in COMMANDS else ("--help", [])
+        name, others = (others[0], ["--help"]) if others[:1] and others[0] in SUMMARIES else ("--help", [])
     if name == "--version":
         from importlib.metadata import version
 
@@ -117,11 +114,11 @@ def parsed(arguments: Sequence[str]) -> Command:
     if name in ("-h", "--help"):
         print(overview(), end="")
         raise SystemExit(0)
-    if name not in COMMANDS:
-        near = get_close_matches(name, COMMANDS, n=1)
+    if name not in SUMMARIES:
+        near = get_close_matches(name, SUMMARIES, n=1)
         kind = "option" if name.startswith("-") else "command"
         wrong = f"unknown {kind} '{name}'" if name else "no command given"
-        hint = f"did you mean '{near[0]}'?" if near else f"the commands are {', '.join(COMMANDS)};"
+        hint = f"did you mean '{near[0]}'?" if near else f"the commands are {', '.join(SUMMARIES)};"
         complain(f"{wrong}; {hint} see modeler --help")
         raise SystemExit(2)
     import tyro
@@ -266,63 +263,3 @@ def _open_standard_streams() -> None:
 def _close_stdout() -> None:
     """Discard further output, also at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-_DESCRIPTION: Final = (
-    "Object models from depth-camera sequences. Data goes to stdout, progress and messages to stderr. "
-    f"--version prints the version. {messages.HELP}"
-)
-_WIDEST: Final = 120  # columns of text, which no one reads wider
-
-
-class Command(Protocol):
-    """A frozen dataclass of options."""
-
-    def run(self) -> int:
-        """Return the exit status."""
-        ...
-
-
-COMMANDS: Final = {
-    "build": "build",
-    "batch": "batch",
-    "info": "convert",
-    "convert": "convert",
-    "calibrate-sensor": "calibrate",
-    "calibrate-camera": "calibrate",
-    "register": "evaluate",
-    "evaluate": "evaluate",
-    "render": "convert",
-    "view": "pages",
-    "report": "pages",
-    "export": "export",
-    "track": "track",
-    "join": "edit",
-    "edit": "edit",
-    "suggest": "edit",
-    "gallery": "pages",
-    "studio": "pages",
-}
-"""The module of each command, in the order in which help lists them."""
-
-
-def command_class(name: str) -> type[Command]:
-    """Return the command of a name; only its module is imported."""
-    module = importlib.import_module(f"modeler.cli.{COMMANDS[name]}")
-    return getattr(module, name.title().replace("-", ""))
-
-
-def overview() -> str:
-    """Return the help of the program, with the first sentence about each command, as wide as the terminal."""
-    width = max(min(shutil.get_terminal_size().columns, _WIDEST), 40)
-    column = 4 + max(map(len, COMMANDS))
-
-    def filled(text: str, lead: str = "", margin: int = 0) -> str:
-        return textwrap.fill(text, width, initial_indent=lead, subsequent_indent=" " * margin) + "\n"
-
-    told = {name: (command_class(name).__doc__ or "").partition("\n\n")[0] for name in COMMANDS}
-    commands = "".join(filled(words, f"  {name}".ljust(column), column) for name, words in told.items())
-    return (
-        "usage: modeler COMMAND [OPTIONS]\n\n"
-        f"{filled(_DESCRIPTION)}\ncommands (modeler COMMAND --help tells all about one):\n{commands}"
-    )

@@ -55,9 +55,9 @@ def as_options(words: str) -> str:
 @cache
 def _options() -> dict[str, str]:
     """Return the options of all commands by the names of their parameters."""
-    from modeler.cli import COMMANDS, command_class
+    from modeler.cli.overview import SUMMARIES, command_class
 
-    groups, names = list[Any](map(command_class, COMMANDS)), set[str]()
+    groups, names = list[Any](map(command_class, SUMMARIES)), set[str]()
     while groups:
         for field in fields(groups.pop()):
             names.add(field.name)
