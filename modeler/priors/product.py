@@ -11,7 +11,6 @@ import numpy.typing as npt
 from modeler.priors.general import GeneralPrior
 from modeler.priors.mixtures import Alternatives, Gaussian, fitted
 from modeler.priors.table import TablePrior, support
-from modeler.registration.posterior import PRIOR_SAMPLES
 from modeler.significance import RARE, nats_from_mode
 from modeler.types import (
     AbstractPoseDensity,
@@ -26,6 +25,7 @@ from modeler.types import (
 )
 
 _DRAWS = 5000
+_FITTED = 1000
 _ROUNDS = 5
 _GAUSSIAN_SHARE = 0.8
 _INFLATION = 1.3  # factor on the fitted Gaussian's standard deviations, so that weights stay bounded
@@ -124,13 +124,13 @@ def multiplied(first: AbstractPoseDensity, second: AbstractPoseDensity, centre_m
             return None
         weights = np.exp(log_weights - top)
         log_volume = float(top + np.log(weights.mean()))
-        chosen = drawn[resampled(weights, PRIOR_SAMPLES, rng)]
-        gaussian = fitted(chosen, np.full(PRIOR_SAMPLES, 1.0 / PRIOR_SAMPLES), centre_m, _INFLATION)
+        chosen = drawn[resampled(weights, _FITTED, rng)]
+        gaussian = fitted(chosen, np.full(_FITTED, 1.0 / _FITTED), centre_m, _INFLATION)
     assert gaussian is not None
     product = Product(first, second, gaussian, log_volume)
-    drawn = product.sample(PRIOR_SAMPLES, rng)
+    drawn = product.sample(_FITTED, rng)
     for part in (first, second):
-        usual, here = (np.median(part.log_density(poses)) for poses in (part.sample(PRIOR_SAMPLES, rng), drawn))
+        usual, here = (np.median(part.log_density(poses)) for poses in (part.sample(_FITTED, rng), drawn))
         if here < usual - nats_from_mode(RARE):
             return None
     return product
