@@ -129,12 +129,12 @@ def test_a_brick_may_lie_either_way_round_and_that_is_said() -> None:
     poses = tabletop.turntable(12)
     views, placed = brick_views(poses), tabletop.trajectory(poses)
     halves = range(0, 12, 2), range(1, 12, 2)  # no image is in both: noise would tell which way it lies
-    parts = [Segment({k: views[k] for k in half}, Solution({k: placed[k] for k in half}), ()) for half in halves]
+    one, other = (Segment({k: views[k] for k in half}, Solution({k: placed[k] for k in half}), ()) for half in halves)
     halfway = se3.exp(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0]))
     quarter = se3.exp(np.array([0.0, 0.0, 0.5 * np.pi, 0.0, 0.0, 0.0]))
     ways = [Alignment(pose) for pose in (quarter, np.eye(4), halfway)]
-    found = Joiner().weighted(*parts, ways)
-    assert [Joiner().is_consistent(*parts, way) for way in found] == [True, True, False]
+    found = Joiner().weighted(one, other, ways)
+    assert [Joiner().is_consistent(one, other, way) for way in found] == [True, True, False]
     assert 0.05 < found[0].share < 0.95
     assert found[1].share > 0.05
     assert found[2].share < 1e-6
