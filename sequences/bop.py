@@ -253,7 +253,7 @@ def finest_unit_mm(farthest_m: float) -> float:
 
 
 def scene_meta(sequence: AbstractSequence) -> dict[str, object]:
-    """Return the entries of `sequence.json` that a sequence knows of itself."""
+    """Return the entries of `sequence.json` that a sequence has of itself."""
     meta: dict[str, object] = {"name": sequence.name}
     noise, motion = sequence.sensor(), sequence.motion
     if noise is not None:

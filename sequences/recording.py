@@ -40,7 +40,7 @@ class AbstractRecording(AbstractSequence):
     calibrated: bool = field(default=False, kw_only=True)
     """Whether the intrinsics are of a calibration of this camera, not typed in or nominal."""
     kind: str | None = field(default=None, kw_only=True)
-    """Kind of the depth camera, of `MULTIPATH`, where the format tells it."""
+    """Kind of the depth camera, of `MULTIPATH`, where the format states it."""
 
     def __post_init__(self) -> None:
         """Check `sequence.json`."""
@@ -62,7 +62,7 @@ class AbstractRecording(AbstractSequence):
         return (self.path,)
 
     def sensor(self) -> SensorNoise | None:
-        """Return the noise of the camera from `sequence.json` and as the format tells it; None if neither says."""
+        """Return the noise of the camera from `sequence.json` and as the format states it; None if neither says."""
         node = self.facts.get("sensor")
         by_format = SensorNoise(
             sigma_r_m=None,

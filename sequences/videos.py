@@ -141,7 +141,7 @@ def _camera(calibration: Node, purpose: str) -> Node:
     for entry in calibration.need("CalibrationInformation").need("Cameras").elements():
         if entry.need("Purpose").value == purpose:
             return entry
-    raise InputError(f"{calibration.path}: its calibration knows no {purpose}; record it again.")
+    raise InputError(f"{calibration.path}: its calibration has no {purpose}; record it again.")
 
 
 _AGAIN = "record or copy it again"

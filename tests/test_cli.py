@@ -25,7 +25,7 @@ from modeler.composition.options import PriorOptions
 from modeler.export import RunFolder, model_upright
 from modeler.sequences import bundled, open_sequence
 from modeler.types import ACCEPTED, Outcome
-from modeler.verdict.advice import measured_step, sign_in_doubt, visible_frames
+from modeler.verdict.advice import measured_step, sign_is_ambiguous, visible_frames
 
 TUBE = bundled("tube")
 QUICK = ("--prior", "table", "--voxel-m", "0.004", "--frames", "0:3")
@@ -350,10 +350,10 @@ def test_a_turn_that_is_given_by_hand_counts_more(frames: slice, given_deg: floa
 def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
     lost = {"frames": [{"cause": ""}, {"cause": Outcome.NO_OVERLAP.label}], "reason_codes": ["left_out"]}
     known, unknown = (priors.TurntablePrior(-25.0, 3.0, step_sign=sign) for sign in ("known", "unknown"))
-    assert sign_in_doubt(lost, known)
-    assert not sign_in_doubt(lost, unknown)
-    assert not sign_in_doubt(lost, priors.TablePrior())
-    assert not sign_in_doubt({"frames": [], "reason_codes": ["interrupted"]}, known)
+    assert sign_is_ambiguous(lost, known)
+    assert not sign_is_ambiguous(lost, unknown)
+    assert not sign_is_ambiguous(lost, priors.TablePrior())
+    assert not sign_is_ambiguous({"frames": [], "reason_codes": ["interrupted"]}, known)
 
 
 def test_a_step_that_the_views_contradict_is_reported() -> None:

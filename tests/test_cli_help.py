@@ -42,8 +42,8 @@ def test_help_of_the_program_tells_each_command_in_a_sentence_and_a_command_tell
 
 def test_help_of_the_program_has_the_first_sentence_of_each_command_without_importing_it() -> None:
     assert set(SUMMARIES) == set(COMMANDS)
-    for name, told in SUMMARIES.items():
-        assert " ".join((command_class(name).__doc__ or "").split("\n\n")[0].split()) == told
+    for name, summary in SUMMARIES.items():
+        assert " ".join((command_class(name).__doc__ or "").split("\n\n")[0].split()) == summary
     script = "import atexit, sys; atexit.register(lambda: print('tyro' in sys.modules)); import modeler.cli as cli; "
     assert spawned("-c", f"{script} cli.main(['--help'])").out.endswith("False\n")
 

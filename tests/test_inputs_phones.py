@@ -150,7 +150,7 @@ def test_names_that_are_angles_are_reported(
     write_camera(tmp_path, frames[0].camera)
     options = PriorOptions(prior="turntable", step_deg=step_deg)
     if refused:
-        with pytest.raises(InputError, match=r"576° apart; if the names are angles, give --step-deg 1"):
+        with pytest.raises(InputError, match=r"576° apart; if the names are angles, give `step_deg` 1"):
             compose.resolved_prior(options, open_sequence(tmp_path))
     else:
         assert compose.resolved_prior(options, open_sequence(tmp_path))[0] == "turntable"

@@ -27,7 +27,7 @@ from modeler.types import InputError
 _HOST: Final = "127.0.0.1"
 _LOOPBACK: Final = (_HOST, "localhost")
 PATIENCE_S: Final = 20.0  # until it listens, on a busy machine, or sends a byte
-STOP_S: Final = 3.0  # until it has ended when told to
+STOP_S: Final = 3.0  # until it has ended once asked to
 # Runs the viewer so that Linux kills it when the process that started it ends, however that ends (prctl, option
 # PR_SET_PDEATHSIG, survives exec). That process may have ended before the option was set.
 _DIE_WITH_PARENT: Final = """\

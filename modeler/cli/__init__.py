@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.root.addHandler(messages.ToLog())
     for handler in logging.root.handlers:
         handler.addFilter(worded_as_options)
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it tells of a home that it cannot write to
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it cannot write to
     logging.raiseExceptions = False  # stderr may be full
     # Our matrices are small: waking BLAS threads takes longer than their work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -129,8 +129,8 @@ def parsed(arguments: Sequence[str]) -> Command:
     unasked = SimpleNamespace(check_type=lambda value, _: value, TypeCheckError=TypeError)
     try:
         with contextlib.redirect_stderr(box), _instead_of("typeguard", unasked):
-            told = f"{inspect.cleandoc(command.__doc__ or '')}\n\n{messages.HELP}"
-            return tyro.cli(command, prog=f"modeler {name}", description=told, args=others, config=style)
+            description = f"{inspect.cleandoc(command.__doc__ or '')}\n\n{messages.HELP}"
+            return tyro.cli(command, prog=f"modeler {name}", description=description, args=others, config=style)
     except SystemExit as ending:
         if ending.code:
             complain(f"{_one_line(box.getvalue())}; see modeler {name} --help")

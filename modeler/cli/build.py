@@ -293,7 +293,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
     from modeler.verdict.advice import (
         estimated_focal_length,
         measured_step,
-        sign_in_doubt,
+        sign_is_ambiguous,
         unchecked_focal_length,
         visible_frames,
     )
@@ -321,7 +321,7 @@ def _summarise(report: Mapping[str, Any], options: Build, prior: AbstractPrior) 
             say(f"not to be trusted: {words}")
         if len(reasons) > _SHOWN_REASONS:
             say(f"for {len(reasons) - _SHOWN_REASONS} more, see {options.out / 'report.json'}")
-        if sign_in_doubt(report, prior):
+        if sign_is_ambiguous(report, prior):
             say("the given direction of rotation is assumed; if it may be the opposite, give --step-sign unknown")
     for remark in (
         measured_step(report["edges"], prior),

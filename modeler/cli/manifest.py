@@ -114,7 +114,7 @@ def _checked(words: tuple[str, ...], common: tuple[str, ...]) -> tuple[str, ...]
 def named(rows: Sequence[Row], out: Path) -> Mapping[str, Row]:
     """Return sequences by the names of their run folders, in order.
 
-    A sequence that the folder knows keeps its name. Others are called as their file or folder, and where that name is
+    A sequence that is in the folder keeps its name. Others are called as their file or folder, and where that name is
     taken, with a few digits more, which depend on nothing but their path.
     """
     notes = sorted((out / NOTES).glob("*.json")) if (out / NOTES).is_dir() else []

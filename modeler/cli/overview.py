@@ -90,8 +90,8 @@ def overview() -> str:
     def filled(text: str, lead: str = "", margin: int = 0) -> str:
         return textwrap.fill(text, width, initial_indent=lead, subsequent_indent=" " * margin) + "\n"
 
-    commands = "".join(filled(told, f"  {name}".ljust(column), column) for name, told in SUMMARIES.items())
+    commands = "".join(filled(summary, f"  {name}".ljust(column), column) for name, summary in SUMMARIES.items())
     return (
         "usage: modeler COMMAND [OPTIONS]\n\n"
-        f"{filled(_DESCRIPTION)}\ncommands (modeler COMMAND --help tells all about one):\n{commands}"
+        f"{filled(_DESCRIPTION)}\ncommands (modeler COMMAND --help describes one in full):\n{commands}"
     )

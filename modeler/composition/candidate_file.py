@@ -60,7 +60,7 @@ class Pose:
     name: str = ""
     cost: float = Candidate.cost
     sigma_deg: float = HeldPrior.held_sigma_deg
-    """Standard deviation of its rotation, that of a hand that holds the object (`--held-sigma-deg`)."""
+    """Standard deviation of its rotation, that of a hand that holds the object (`held_sigma_deg`)."""
     sigma_m: float = HeldPrior.held_sigma_m
     """Standard deviation of its place."""
 

@@ -233,8 +233,8 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
     apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
     if "turntable" in name.split("+") and step_deg is not None and apart > 1 and apart * abs(step_deg) > _TURN_DEG:
         raise InputError(
-            f"--step-deg {step_deg:g} is from one frame number to the next, and these go up by {apart}, as angles in "
-            f"names do: frames would be {apart * step_deg:g}° apart; if the names are angles, give --step-deg 1"
+            f"`step_deg` {step_deg:g} is from one frame number to the next, and these go up by {apart}, as angles in "
+            f"names do: frames would be {apart * step_deg:g}° apart; if the names are angles, give `step_deg` 1"
         )
     if "turntable" in name.split("+") and step_deg is not None and apart > 1:
         assumed.append(

@@ -22,7 +22,7 @@ def write_usd(files: PhysicsFiles, model: ObjectModel, texture: Texture | None, 
     """Write the object as one rigid body, in m and kg, z up; its texture is `files.texture` beside it.
 
     Mass, centre and principal moments of inertia are at the body, convex parts as they are at its colliders, for not
-    every program heeds an approximation that it is told to make.
+    every program heeds an approximation that it is asked to make.
 
     Raises:
         ImportError: if usd-core is not installed.

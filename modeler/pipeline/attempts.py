@@ -44,7 +44,8 @@ from modeler.verdict.evidence import distance_nats
 
 _LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
 _MIN_OVERLAP_GAIN = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
-_UNEVEN_SHARE = 0.25  # of the way: standard deviation in the middle between two views, if the speed is uneven
+_UNEVEN_SHARE = 0.25
+"""Of the way: standard deviation in the middle between two views, if the speed is uneven (anywhere between: 0.29)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,16 +136,16 @@ class Search:
         What was given of the motion is not part of them. So they would be the only evidence for themselves.
         """
         first = self.found.get(self.first)
-        return tuple(found for found in self.posteriors if found is first or not self._told_otherwise(found))
+        return tuple(found for found in self.posteriors if found is first or not self._contradicts_prior(found))
 
-    def _told_otherwise(self, posterior: Posterior) -> bool:
+    def _contradicts_prior(self, posterior: Posterior) -> bool:
         """Return whether a registration contradicts a prior that was given."""
         if not posterior.usable:
             return False
         means = np.stack([mode.pose.mean for mode in posterior.modes] or [posterior.pose.mean])
         steps = self.state.steps(self.view.index, posterior.target)
         prior = self.prior.following(posterior.target)
-        return told_otherwise(prior, self.view, self.state.views[posterior.target], steps, means)
+        return contradicts_prior(prior, self.view, self.state.views[posterior.target], steps, means)
 
     @property
     def _probably_hidden(self) -> bool:
@@ -155,7 +156,7 @@ class Search:
         return self.state.failed_searches > 0 and not (first_try or matched or placed)
 
 
-def told_otherwise(prior: AbstractPrior, source: RayImage, target: RayImage, steps: int, motions: Array) -> bool:
+def contradicts_prior(prior: AbstractPrior, source: RayImage, target: RayImage, steps: int, motions: Array) -> bool:
     """Return whether all of some motions contradict a prior that was given, as the verdict would say (13.2).
 
     Args:

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 
 from modeler import se3
 from modeler.closure import MapView
-from modeler.pipeline.attempts import told_otherwise
+from modeler.pipeline.attempts import contradicts_prior
 from modeler.pipeline.joining import MIN_JOINS, Joiner, Segment, rejected_elsewhere
 from modeler.pipeline.pairs import Prepared
 from modeler.pipeline.state import State
@@ -62,7 +62,7 @@ Measured: with 0.01, 0.02 and 0.04, masks of a drawn capture have 0.985, 0.984 a
 common.
 """
 _CELLS: Final = 2**20  # along each axis, of which a scene fills a hundred
-_SURER: Final = 0.25  # by which the other views have to be surer than the view itself: cubes at a rim hold both
+_OVERRULED_BY: Final = 0.25  # by which the other views have to be margin than the view itself: cubes at a rim hold both
 _APART: Final = 2.5  # cubes, a seventh of the object's radius, between parts of one thing
 
 Cubes = npt.NDArray[np.int64]
@@ -240,7 +240,7 @@ class Realigner:
             return None
         views, motion = state.views, merged.solution.relative(before, after)
         steps = state.steps(after, before)
-        if told_otherwise(tracker.learned_prior, views[after], views[before], steps, motion[None]):
+        if contradicts_prior(tracker.learned_prior, views[after], views[before], steps, motion[None]):
             return None
         kept = {*target.graph.edges, *source.graph.edges}
         others = [edge for edge in state.graph.edges if edge not in kept]
@@ -302,9 +302,9 @@ class Majority:
         elsewhere = self._elsewhere[place] & (known[place] == cubes)
         share[elsewhere] = 0.0
         # A view that takes another thing for the object does not count at all.
-        surer = 0.0 if 2 * np.count_nonzero(own & elsewhere) > np.count_nonzero(own) else _SURER
+        margin = 0.0 if 2 * np.count_nonzero(own & elsewhere) > np.count_nonzero(own) else _OVERRULED_BY
         mask = np.zeros_like(seen)
-        mask[seen] = share > np.where(own, 0.5 - surer, 0.5 + surer)
+        mask[seen] = share > np.where(own, 0.5 - margin, 0.5 + margin)
         return without_specks(mask)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Registration: the visibility method, a registrar of two views that knows how sure it is."""
+"""Registration: the visibility method, posteriors of the motion between two views."""
 
 from modeler.registration.visibility import VisibilityLikelihood as VisibilityLikelihood
 from modeler.registration.visibility import VisibilityRegistrar as VisibilityRegistrar

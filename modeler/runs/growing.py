@@ -142,7 +142,7 @@ class Growth:
     def _edges(self, before: Reopened, new: Mapping[int, RayImage], poses: Mapping[int, Array]) -> list[Edge]:
         """Return edges of new views with the model's views from nearly the same side, and with the new one before."""
         method, edges = VisibilityRegistrar(), list[Edge]()
-        # So wide that each registration that is not ambiguous tells more than the pose about which it was made.
+        # So wide that each registration that is not ambiguous determines more than the pose about which it was made.
         joiner = Joiner(Registrations(method, self.seed), sigma_rad=2.0 * float(np.radians(method.max_sigma_deg)))
         old, added = (
             Segment(before.views, before.solution, before.edges),

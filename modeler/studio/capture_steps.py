@@ -45,7 +45,7 @@ _CAMERAS: Final = {
 }
 """Connected cameras, by the names under which sequences open them."""
 _BEAT_S: Final = 5.0  # of the metronome, to begin with
-_NOTES_HZ: Final = {"tick": 880, "placed": 660, "lost": 220}  # which are told apart
+_NOTES_HZ: Final = {"tick": 880, "placed": 660, "lost": 220}  # which can be distinguished
 TONE: Final = """<script>
 window.tone = (hertz) => {
   window.sound = window.sound || new AudioContext();

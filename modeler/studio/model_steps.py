@@ -55,7 +55,7 @@ _CAMERA: Final = {
     "The focal length is right": "focal-length",
     "The depth is right": "depth",
 }
-"""What `calibrate-camera` is told to be known, by the words of its button."""
+"""What `calibrate-camera` takes for known, by the words of its button."""
 
 
 class CheckStep:

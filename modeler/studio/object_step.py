@@ -66,7 +66,7 @@ class ObjectStep:
                     )
                     self._tools(scan)
                 with div("card"):
-                    self.told = ui.label().classes("text-body2").props("role=status")
+                    self.status = ui.label().classes("text-body2").props("role=status")
                     main_button("Next: build", lambda: self.page.go("Build"))
                 self.line = command_line()
         self._draw_strip(scan)
@@ -105,7 +105,7 @@ class ObjectStep:
                 image.update()
             mark(button, "on", on=k == self.frame)
             mark(button, "doubt", on=k in doubts)
-        self.told.text = _told(scan, doubts)
+        self.status.text = _status(scan, doubts)
         self.line.text = scan.line()
 
     def turn(self, by: int) -> None:
@@ -168,7 +168,7 @@ def frame_address(scan: Scan, kind: str, frame: int) -> str:
     return f"/{kind}/{quote(scan.name)}/{frame}.jpg?v={state}"
 
 
-def _told(scan: Scan, doubts: dict[int, str]) -> str:
+def _status(scan: Scan, doubts: dict[int, str]) -> str:
     """Return what is known of the masks in words."""
     count, total = len(scan.found), len(scan.sequence.indices)
     if scan.fault:

@@ -47,9 +47,9 @@ _POLICY: Final = (
     "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; object-src 'none'; base-uri 'self'; "
     "connect-src 'self' data: blob: http://127.0.0.1:*; form-action 'self'; frame-ancestors 'self'; frame-src 'self'"
 )
-"""For browsers: nothing is loaded from elsewhere, nothing told. Rerun's viewer, which we hand on, asks its makers for
-fonts and news, and reports to them; what a running build sends it takes from a port of its own. The libraries beneath
-compile their templates in the page."""
+"""For browsers: nothing is loaded from elsewhere, nothing reported. Rerun's viewer, which we hand on, asks its makers
+for fonts and news, and reports to them; what a running build sends it takes from a port of its own. The libraries
+beneath compile their templates in the page."""
 _HEADERS: Final = (
     (b"content-security-policy", _POLICY.encode()),
     (b"referrer-policy", b"no-referrer"),
@@ -235,7 +235,7 @@ def serve(studio: Studio, port: int, announce: Callable[[str], None]) -> None:
     app = _application(studio, viewers)
     guarded = Guard(app, token, port)
     nicegui.app.timer(POLL_S, studio.queue.advance)
-    logging.getLogger("nicegui").setLevel(logging.ERROR)  # it tells of slow machines
+    logging.getLogger("nicegui").setLevel(logging.ERROR)  # it warns of slow machines
     config = uvicorn.Config(
         guarded,
         log_level="critical",

@@ -67,8 +67,9 @@ def of_the_model(seen: RayImage, pose: PoseGaussian, renderer: ModelRenderer) ->
 
     Point-to-plane distances have rows a = (p × n, n), with mean B of a aᵀ. If distances err by σ, alike within each of
     K patches, a solution from surface alone, of covariance C, is moved with the covariance (σ² / K) B⁻¹ = (σ² / K) s C.
-    In the direction in which surface tells most, it tells nearly all: 1 / s is the largest eigenvalue of C B. Places of
-    colours and outlines on the model err as its surface does, so that what they tell counts alike (method, eq. 15.2).
+    In the direction that surface determines best, it has nearly all information: 1 / s is the largest eigenvalue of
+    C B. Places of colours and outlines on the model err as its surface does, so that their information counts alike
+    (method, eq. 15.2).
 
     Args:
         seen: the object in the frame.

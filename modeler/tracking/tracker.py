@@ -203,7 +203,7 @@ class Tracker:
         """Return a frame prepared for registration; None if too little of an object is seen.
 
         Args:
-            frame: with a mask, or one that the scene tells.
+            frame: with a mask, or one that the scene determines.
             support: whether the plane is looked for on which the object in a mask stands, a quarter of the time.
             plane: that plane, if it is known.
         """

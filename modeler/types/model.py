@@ -81,7 +81,7 @@ class Contradictions:
 
 @dataclass(frozen=True, eq=False)
 class ColourAlignment:
-    """Where colour is against depth, as far as print tells that several views see: a Gaussian."""
+    """Where colour is against depth, as far as print that several views see determines it: a Gaussian."""
 
     mean: Array
     """(3,) shift right and down in px, and logarithm of the scale about the middle of the image."""

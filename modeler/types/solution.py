@@ -224,7 +224,7 @@ class Solution:
         return frozenset(self.outliers)
 
     @property
-    def knows_motions(self) -> bool:
+    def has_relative_covariances(self) -> bool:
         """Whether covariances of motions between any two frames can be computed."""
         return self.relative_covariance is not _unsolved
 

@@ -59,7 +59,7 @@ def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors
     return outcome_advice(reason.outcome, prior, failed)
 
 
-def sign_in_doubt(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
+def sign_is_ambiguous(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
     """Return whether views overlap so little that a table may turn in the other direction than its prior assumes.
 
     Args:
@@ -110,9 +110,9 @@ def step_angles_deg(edges: Sequence[Mapping[str, Any]]) -> list[float]:
 
 
 def _sure_turns_deg(edges: Sequence[Mapping[str, Any]]) -> tuple[Array, float]:
-    """Return the turns from one frame number to the next, of the least gap that occurs, that edges are sure of.
+    """Return the turns from one frame number to the next, of the least gap that occurs, that edges determine.
 
-    An edge is sure whose heaviest mode leaves all others the probability at which a pose is called wrong.
+    An edge determines one whose heaviest mode leaves all others the probability at which a pose is called wrong.
 
     Args:
         edges: of the report.

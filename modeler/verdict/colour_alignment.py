@@ -58,7 +58,7 @@ def colour_alignment(compared: Comparison, start: Displacement) -> ColourAlignme
             longest_px = max(abs(step[0]), abs(step[1]), abs(step[2]) * 0.25 * width)  # beyond, features are not linear
             mean = np.asarray(mean + step * min(1.0, width_px / max(longest_px, 1e-9)), dtype=np.float64)
     _, information = _evidence(compared, shared, start.moved_to(mean), compared.width_px)
-    if compared.correlation(start.moved_to(mean), compared.width_px) < AT_LEAST:  # what agrees by chance tells nothing
+    if compared.correlation(start.moved_to(mean), compared.width_px) < AT_LEAST:  # chance has no information
         mean, information = np.array([*start.shift_px, np.log(start.scale)]), np.zeros((3, 3))
     covariance = np.asarray(np.linalg.inv(information + prior), dtype=np.float64)
     return ColourAlignment(mean, covariance, start.flip, start.frames)

@@ -340,7 +340,7 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
     frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
     frames = spread(frames, MAX_VIEWS)
     reaches_m = {frame: nearest_around(views[frame]) for frame in frames}
-    looks, absent = np.zeros((2, len(frames), len(frames))), np.zeros((len(frames), 2))
+    looks, false_surface = np.zeros((2, len(frames), len(frames))), np.zeros((len(frames), 2))
     surface: list[Array] = []  # by frame: of it in the free space of others, and of others in its free space
     free: list[list[Array]] = [[] for _ in frames]
     for row, frame in enumerate(frames):
@@ -349,20 +349,20 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
         for column, other in enumerate(frames):
             if other != frame:
                 motion = se3.inverse(trajectory[other]) @ trajectory[frame]
-                carried_m, turned = se3.transform(motion, points_m), normals @ motion[:3, :3].T
-                found = looked_up(views[other], reaches_m[other], carried_m, turned, tolerance_m)
+                moved_m, turned = se3.transform(motion, points_m), normals @ motion[:3, :3].T
+                found = looked_up(views[other], reaches_m[other], moved_m, turned, tolerance_m)
                 tally += found
-                free[column].append(pixels_of(views[other], carried_m[found[0]]))
+                free[column].append(pixels_of(views[other], moved_m[found[0]]))
                 looks[:, row, column] = found.sum(axis=1)
         through, judged = tally[0], tally.sum(axis=0) >= 2
-        absent[row] = np.sum(judged & (through >= 2) & (through > tally[1])), judged.sum()
+        false_surface[row] = np.sum(judged & (through >= 2) & (through > tally[1])), judged.sum()
         surface.append(np.column_stack([places, tally.T])[through > 0])
     through, seen = looks.sum(axis=1) + looks.sum(axis=2)  # which of the two is wrong is unknown
     known = through + seen >= _MIN_POINTS
     if not known.any():
         return None
     shares = np.where(known, through / np.maximum(through + seen, 1.0), 0.0)
-    bare = np.where(absent[:, 1] >= _MIN_JUDGED, absent[:, 0] / np.maximum(absent[:, 1], 1.0), 0.0)
+    bare = np.where(false_surface[:, 1] >= _MIN_JUDGED, false_surface[:, 0] / np.maximum(false_surface[:, 1], 1.0), 0.0)
     worst, barest = int(np.argmax(shares)), int(np.argmax(bare))
     return FreeSpace(
         frames[worst],

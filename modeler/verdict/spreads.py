@@ -71,7 +71,7 @@ class AboutMean:
     def of(cls, solution: Solution) -> AboutMean:
         """Return the uncertainty of solved poses; without that of motions between any two, relative to the first."""
         frames = sorted(solution.covariances)
-        if not solution.knows_motions or len(frames) < 2:
+        if not solution.has_relative_covariances or len(frames) < 2:
             return cls({k: _given_focal_length(solution, k, None) for k in frames}, dict.fromkeys(frames[:1], 1.0))
         some = spread(frames, SOME_VIEWS)
         to_object = {frame: se3.adjoint(solution.trajectory[frame]) for frame in frames}
@@ -288,13 +288,13 @@ def widened(model: ObjectModel, solution: Solution) -> ObjectModel:
         solution: with covariances of motions; without these, poses count as exact.
     """
     frames = spread(list(solution.trajectory), SOME_VIEWS)
-    if model.vertex_sigmas_m is None or not (solution.focal or solution.knows_motions) or len(frames) == 0:
+    if model.vertex_sigmas_m is None or not (solution.focal or solution.has_relative_covariances) or len(frames) == 0:
         return model
     shares = _shares_of_views(model, [solution.trajectory[frame] for frame in frames])
     variances_m2 = np.zeros(len(shares))
     if solution.focal is not None:
         variances_m2 += (solution.focal.sigma * _moved_by_focal(model, shares, solution, solution.focal, frames)) ** 2
-    if solution.knows_motions and len(frames) > 1:
+    if solution.has_relative_covariances and len(frames) > 1:
         variances_m2 += _of_poses(model, shares, solution, frames)
     return replace(model, vertex_sigmas_m=np.sqrt(model.vertex_sigmas_m**2 + variances_m2))
 

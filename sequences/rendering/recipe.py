@@ -98,7 +98,7 @@ class Turntable:
 
 @dataclass(frozen=True)
 class RobotReadings:
-    """How well a robot knows where the hand is that holds the object."""
+    """Errors of a robot's readings of where the hand is that holds the object."""
 
     sigma_deg: float = 1.0
     """Standard deviation of a pose's rotation about each axis."""

@@ -77,10 +77,10 @@ def _trials(pair: Pair, limits: Iterable[Limits], seed: tuple[int, int], *, colo
     def by(registrar: AbstractRegistrar, limit: Limits) -> Posterior:
         return registrar.register(pair.source, pair.target, pair.density(limit), rng=np.random.default_rng(seed))
 
-    untold = Modeler(registrar=ours, prior=AutoPrior(), seed=seed[0])  # as `modeler register` does
-    methods = {f"visibility, {told}": partial(by, ours, told) for told in limits if told != "default"}
+    without_limits = Modeler(registrar=ours, prior=AutoPrior(), seed=seed[0])  # as `modeler register` does
+    methods = {f"visibility, {given}": partial(by, ours, given) for given in limits if given != "default"}
     if "default" in limits:
-        methods["visibility, default"] = partial(untold.register, pair.source, pair.target)
+        methods["visibility, default"] = partial(without_limits.register, pair.source, pair.target)
     methods["fpfh-icp"] = partial(by, FpfhIcpRegistrar(), "none")
     if fpfh.kiss_installed():
         methods["kiss"] = partial(by, KissIcpRegistrar(), "none")

@@ -17,7 +17,7 @@ from studies.ablation.pairs import SHARED, recorded_views
 from studies.calibration.specimens import Half, load_specimen
 from studies.calibration.study import Condition, rendered_views, staged
 
-Limits = Literal["told", "none", "default"]
+Limits = Literal["given", "none", "default"]
 """Prior of the motion: limits that contain it, wide limits, or the defaults."""
 
 STEPS: Final = 4
@@ -65,7 +65,7 @@ class Pair:
 
     def density(self, limits: Limits) -> AbstractPoseDensity:
         """Return the prior of the motion for given or wide limits."""
-        if limits == "told":
+        if limits == "given":
             reach_deg = 50.0 if self.turn_deg < 40.0 else min(self.turn_deg + 20.0, 180.0)
             return GeneralPrior(reach_deg, 0.09).between(self.source, self.target)
         return GeneralPrior(180.0, 0.2).between(self.source, self.target)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from studies.in_hand.study import HOLDERS, SHAPES, TOLD, Outcome, outcome, table
+from studies.in_hand.study import GIVEN, HOLDERS, SHAPES, Outcome, outcome, table
 from studies.results_file import earlier_results
 
 
@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m studies in_hand", description=__doc__)
     parser.add_argument("--holder", nargs="+", choices=HOLDERS, default=HOLDERS, help="whose hand")
     parser.add_argument("--shape", nargs="+", choices=SHAPES, default=SHAPES, help="which shapes")
-    parser.add_argument("--told", choices=TOLD, default="masks", help="given masks or shape of the hand")
+    parser.add_argument("--given", choices=GIVEN, default="masks", help="given masks or shape of the hand")
     parser.add_argument("--out", type=Path, default=Path("runs/in_hand"), help="folder of the results")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -32,9 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found = [Outcome(**{**json.loads(line), "reasons": tuple(json.loads(line)["reasons"])}) for line in lines]
     for holder in options.holder:
         for shape in options.shape:
-            if any((one.holder, one.shape, one.told) == (holder, shape, options.told) for one in found):
+            if any((one.holder, one.shape, one.given) == (holder, shape, options.given) for one in found):
                 continue
-            found.append(outcome(shape, holder, options.told))
+            found.append(outcome(shape, holder, options.given))
             with path.open("a") as stream:
                 print(json.dumps(asdict(found[-1])), file=stream)
             print(found[-1], file=sys.stderr, flush=True)

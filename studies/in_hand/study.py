@@ -31,9 +31,9 @@ from studies.trust.study import f_score
 Holder = Literal["robot", "steady", "person"]
 """A robot that regrasps the object halfway, one that does not, or a person."""
 HOLDERS: Final[tuple[Holder, ...]] = ("robot", "steady", "person")
-Told = Literal["masks", "nothing", "shape"]
+Given = Literal["masks", "nothing", "shape"]
 """What is handed over of the images: masks of object and hand, nothing, or the shape of the robot's hand."""
-TOLD: Final[tuple[Told, ...]] = ("masks", "nothing", "shape")
+GIVEN: Final[tuple[Given, ...]] = ("masks", "nothing", "shape")
 SHAPES: Final = ("drill", "teapot", "figurine", "l_bracket", "rubber_duck", "toy_car", "stapler", "telephone")
 ROBOT_FRAMES, REGRASPED, ROBOT_STEP_DEG = 24, 12, 18.0
 """Of the robot: number of frames, first frame of the second grasp, and the turn from frame to frame."""
@@ -73,10 +73,10 @@ class Outcome:
     reasons: tuple[str, ...]
     seconds: float
     """Wall time of the run without rendering."""
-    told: Told = "masks"
+    given: Given = "masks"
 
 
-def stage(shape: str, holder: Holder, told: Told = "masks", *, motion: Hand | None = None) -> Stage:
+def stage(shape: str, holder: Holder, given: Given = "masks", *, motion: Hand | None = None) -> Stage:
     """Return what is recorded and handed over of the images; a motion replaces the holder's own."""
     seed = SHAPES.index(shape)
     rng = np.random.default_rng([seed, 9])
@@ -104,9 +104,9 @@ def stage(shape: str, holder: Holder, told: Told = "masks", *, motion: Hand | No
     return Stage(
         recipe,
         PriorOptions(prior="velocity" if holder == "person" else "general"),
-        masks=told == "masks",
+        masks=given == "masks",
         others=hands,
-        occluder_of=lambda _, others: others[0] | others[1] if told == "masks" else None,
+        occluder_of=lambda _, others: others[0] | others[1] if given == "masks" else None,
     )
 
 
@@ -142,9 +142,9 @@ def hand_shape(recorded: Recorded) -> HandShape:
     return HandShape(np.array(ends_m), np.array(radii_m), MARGIN_M)
 
 
-def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
+def outcome(shape: str, holder: Holder, given: Given = "masks") -> Outcome:
     """Build the model of one run and compare it with the truth."""
-    recorded = Recorded(stage(shape, holder, told))
+    recorded = Recorded(stage(shape, holder, given))
     modeler = compose.modeler(recorded, recorded.stage.options, MethodOptions(seed=0), ObjectOptions())
     given: AbstractSequence = recorded
     if holder != "person":
@@ -152,7 +152,7 @@ def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
         regrasped = REGRASPED if holder == "robot" else ROBOT_FRAMES
         poses = HandPoses(times_s, hand_poses(recorded, regrasped))
         modeler = replace(modeler, prior=HeldPrior(poses))
-        if told == "shape":
+        if given == "shape":
             given = HandMarkedSequence(recorded, hand_shape(recorded), poses)
     hidden = _hidden(recorded)
     began = time.perf_counter()
@@ -182,7 +182,7 @@ def outcome(shape: str, holder: Holder, told: Told = "masks") -> Outcome:
         0 if last.verdict.trustworthy else 3,
         last.verdict.reasons,
         seconds,
-        told,
+        given,
     )
 
 
@@ -205,5 +205,5 @@ def table(outcomes: Sequence[Outcome]) -> str:
     for one in outcomes:
         cells = f"{one.hidden:.0%}", f"{one.placed}/{one.frames}", f"{one.median_deg:.2f}°", f"{one.worst_deg:.2f}°"
         cells += f"{one.nees:.2f}", f"{one.f_score:.3f}", f"{one.status}", f"{one.seconds:.0f}"
-        lines.append(f"{', '.join((one.holder, one.shape, one.told)):32}" + "".join(f"{cell:>9}" for cell in cells))
+        lines.append(f"{', '.join((one.holder, one.shape, one.given)):32}" + "".join(f"{cell:>9}" for cell in cells))
     return "\n".join(lines)

@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of noise and registration, a run each")
     parser.add_argument("--lies", type=float, default=0.0, metavar="SHARE", help="of closures that come out wrong")
     parser.add_argument("--long", type=int, metavar="N", help="instead: N small frames at 3°, and what each costs")
-    parser.add_argument("--told-truth", action="store_true", help="register by the truth: what all else costs")
+    parser.add_argument("--true-motions", action="store_true", help="register by the truth: what all else costs")
     parser.add_argument("--out", type=Path, default=Path("runs/loops"), help="folder of the results")
     for field, kind in _OF_CLOSER.items():
         parser.add_argument(f"--{field.replace('_', '-')}", type=kind, default=getattr(Closer, field), help="of Closer")
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(_row(_HEADS), flush=True)
     results: dict[str, list[Result]] = {}
     for case, seed in cases:
-        maker = modeler(case, closer, seed, told_truth=options.told_truth, lies=options.lies)
+        maker = modeler(case, closer, seed, true_motions=options.true_motions, lies=options.lies)
         progress = _Progress(case.name, every=20 if options.long else 0)
         result = run(maker, case, progress)
         results.setdefault(case.name, []).append(result)
@@ -83,8 +83,8 @@ def _mean(results: Sequence[Result]) -> Result:
     """Return the mean of a case's results, over those that have each figure."""
     columns: dict[str, Any] = {}
     for name in results[0].values():
-        told = [value for result in results if isinstance(value := result.values()[name], int | float)]
-        columns[name] = float(np.mean(told)) if told else None
+        values = [value for result in results if isinstance(value := result.values()[name], int | float)]
+        columns[name] = float(np.mean(values)) if values else None
     for name in ("frames", "joined", "registrations", "closures", "spanning", "rejected"):
         columns[name] = round(columns[name])
     columns["name"] = results[0].name

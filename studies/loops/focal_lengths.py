@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m studies loops.focal_lengths", description=__doc__)
     parser.add_argument("--shapes", nargs="+", metavar="NAME", help="only these; default: ten asymmetric ones")
     parser.add_argument("--seed", type=int, default=0, help="of poses, noise and registration")
-    parser.add_argument("--sigma", type=float, default=0.05, help="standard deviation of focal lengths that is told")
+    parser.add_argument("--sigma", type=float, default=0.05, help="standard deviation of focal lengths that is stated")
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--step-deg", type=float, default=24.0, help="mean turn from frame to frame")
     parser.add_argument("--out", type=Path, default=Path("runs/focal_lengths.json"), help="file of the results")
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     shapes = options.shapes or [str(shape) for shape in chosen]
     rows = []
     print(
-        f"{'shape':24}{'stated':>8}{'found':>8}{'± %':>6}{'sd':>6}{'before':>8}{'after':>7}{'again':>8}  told by",
+        f"{'shape':24}{'stated':>8}{'found':>8}{'± %':>6}{'sd':>6}{'before':>8}{'after':>7}{'again':>8}  by",
         flush=True,
     )
     for place, shape in enumerate(shapes):

@@ -2,7 +2,7 @@
 
 `python -m studies loops.memory --frames 5000 --out runs/memory` renders an object that turns by 3° a frame, a
 folder of images that is reused, and builds it as the command does: with stored pairs, recording and report. With
---told-truth, ground truth replaces registration, to measure the cost of everything else. With --watch, the folder is
+--true-motions, ground truth replaces registration, to measure the cost of everything else. With --watch, the folder is
 written while it is built, as fast as frames are taken, and with faults: files in two halves, cut off for good, or late,
 links to nothing, intrinsics that are gone for a moment. With --turns, the object is there for so many turns, spread
 over all of the time, as on a stand that is watched all day. Ctrl-C ends it with the frames so far. stdout has a line
@@ -167,7 +167,7 @@ def run() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/memory"), help="folder of the sequence and the run")
     parser.add_argument("--watch", action="store_true", help="write the folder while it is built, with faults")
     parser.add_argument("--turns", type=int, help="with --watch: of --pictures frames each that show the object")
-    parser.add_argument("--told-truth", action="store_true", help="register by the truth")
+    parser.add_argument("--true-motions", action="store_true", help="register by the truth")
     parser.add_argument("options", nargs="*", default=["--prior", "table"], help="of modeler build, after --")
     options = parser.parse_args()
     sequence = options.out / f"{options.shape}-{options.width}-{options.frames}"
@@ -186,13 +186,13 @@ def run() -> int:
         write_repeated(sequence, pictures, count, options.frames)
     Meter.every = options.every
     build.Console = Meter
-    if options.told_truth:
+    if options.true_motions:
         known = open_sequence(pictures).truth() or {}
         truth = {frame: known[frame % period % count] for frame in range(options.frames)}
         compose.registrar = lambda *_, **__: Known(truth)
     watched = ["--watch", "--idle-s", "60"] if options.watch else []
     print("  step  " + "  ".join(f"{name:>7}" for name in _FIELDS) + "             edges      wall   processor")
-    kind = "-told" * options.told_truth + "-watched" * options.watch
+    kind = "-true" * options.true_motions + "-watched" * options.watch
     run_folder = options.out / f"run-{options.width}-{options.frames}{kind}"
     status = main(["build", str(sequence), "--out", str(run_folder), "--overwrite", *watched, *options.options])
     (options.out / f"costs-{options.width}-{options.frames}{kind}.json").write_text(json.dumps(Meter.costs) + "\n")

@@ -69,10 +69,10 @@ class Result:
         return asdict(self)
 
 
-def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, lies: float = 0.0) -> Modeler:
+def modeler(case: Case, closer: Closer, seed: int, *, true_motions: bool = False, lies: float = 0.0) -> Modeler:
     """Return the loop for a case; its model is coarse, as it is not used."""
     noise = case.sequence.sensor()
-    truth = case.truth() if told_truth else None
+    truth = case.truth() if true_motions else None
     registrar = VisibilityRegistrar() if truth is None else Known(truth)
     return Modeler(
         segmenter=Segmenter(),
@@ -85,8 +85,8 @@ def modeler(case: Case, closer: Closer, seed: int, *, told_truth: bool = False, 
     )
 
 
-def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) -> Result:
-    """Build a case and return its figures; `told` receives each step, its processor time and memory."""
+def run(maker: Modeler, case: Case, report: Callable[[Step, float, float], None]) -> Result:
+    """Build a case and return its figures; `report` receives each step, its processor time and memory."""
     indices = case.sequence.indices
     scene = maker.segmenter.scene([case.sequence.frame(index) for index in scene_frames(indices)])
     began = time.process_time()
@@ -97,7 +97,7 @@ def run(maker: Modeler, case: Case, told: Callable[[Step, float, float], None]) 
         step, now = event, time.process_time()
         peak_mib = max(peak_mib, memory_mib())
         registrations += len(step.posteriors)
-        told(step, now - before, memory_mib())
+        report(step, now - before, memory_mib())
         before = now
     assert step is not None
     return _figures(case, replace(step, make_model=no_model), registrations, time.process_time() - began, peak_mib)

@@ -30,14 +30,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenes", type=int, default=masks.SCENES, metavar="N", help="of masks: how many of the half")
     parser.add_argument("--start", type=int, default=0, metavar="K", help="of masks: number of the first one")
     parser.add_argument(
-        "--told", nargs="+", choices=occluded.TOLD, default=occluded.TOLD, help="of occluded: given masks"
+        "--given", nargs="+", choices=occluded.GIVEN, default=occluded.GIVEN, help="of occluded: given masks"
     )
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     if options.study == "masks":
         print(_masks(options.out, options.half, range(options.start, options.start + options.scenes)))
     else:
-        print(_occluded(options.out / "occluded.jsonl", options.told))
+        print(_occluded(options.out / "occluded.jsonl", options.given))
     return 0
 
 
@@ -54,20 +54,20 @@ def _masks(folder: Path, half: Half, numbers: range) -> str:
     return masks.table(results)
 
 
-def _occluded(path: Path, wanted: Sequence[occluded.Told]) -> str:
+def _occluded(path: Path, wanted: Sequence[occluded.Given]) -> str:
     """Return the table of models behind hands and grippers."""
     outcomes = [occluded.Outcome(**json.loads(line)) for line in earlier_results(path)]
-    done = {(one.shape, one.holder, one.told) for one in outcomes}
-    for told in wanted:
-        for holder in occluded.HOLDERS if told != "no hand" else occluded.HOLDERS[:1]:
+    done = {(one.shape, one.holder, one.given) for one in outcomes}
+    for given in wanted:
+        for holder in occluded.HOLDERS if given != "no hand" else occluded.HOLDERS[:1]:
             for shape in occluded.SHAPES:
-                if (shape, holder, told) in done:
+                if (shape, holder, given) in done:
                     continue
-                outcomes.append(occluded.outcome(shape, holder, told))
+                outcomes.append(occluded.outcome(shape, holder, given))
                 with path.open("a") as stream:
                     print(json.dumps(asdict(outcomes[-1])), file=stream)
                 print(outcomes[-1], file=sys.stderr, flush=True)
-    return occluded.table([one for one in outcomes if one.told in wanted])
+    return occluded.table([one for one in outcomes if one.given in wanted])
 
 
 if __name__ == "__main__":

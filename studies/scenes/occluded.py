@@ -26,8 +26,8 @@ Holder = Literal["arm", "gripper"]
 HOLDERS: Final[tuple[Holder, ...]] = ("arm", "gripper")
 """An arm in front of the object, at a different place in every frame; a gripper that holds it and turns with it."""
 SHAPES: Final = ("drill", "teapot", "figurine", "l_bracket", "box")
-Told = Literal["no hand", "masks with hand", "masks", "masks and hand", "nothing", "hand"]
-TOLD: Final[tuple[Told, ...]] = ("no hand", "masks with hand", "masks", "masks and hand", "nothing", "hand")
+Given = Literal["no hand", "masks with hand", "masks", "masks and hand", "nothing", "hand"]
+GIVEN: Final[tuple[Given, ...]] = ("no hand", "masks with hand", "masks", "masks and hand", "nothing", "hand")
 """Given masks: no occlusion; joint masks of object and hand; masks of the object; separate masks of object and hand; no
 masks; masks of the hand alone."""
 FRAMES, STEP_DEG = 12, 30.0
@@ -42,7 +42,7 @@ class Outcome:
     """Name of the object's recipe."""
     holder: Holder
     """What hides it."""
-    told: Told
+    given: Given
     """The given masks."""
     hidden: float
     """Median share of the object's pixels that are hidden."""
@@ -56,22 +56,22 @@ class Outcome:
     """Wall time of the run without rendering."""
 
 
-def stage(shape: str, holder: Holder, told: Told) -> Stage:
+def stage(shape: str, holder: Holder, given: Given) -> Stage:
     """Return what is recorded and handed over: 12 frames, 30° apart on a table."""
     seed = SHAPES.index(shape)
     rng = np.random.default_rng(seed)
     recipe = viewed(load_specimen(shape), rng, seed)
     places = tuple(posed(Tabletop(FRAMES, STEP_DEG, shift_m=SHIFT_M), seed))
     recipe = replace(recipe, trajectory=Places(places))
-    object_alone = Stage(recipe, PriorOptions(prior="table"), masks=told.startswith("masks") or told == "no hand")
-    if told == "no hand":
+    object_alone = Stage(recipe, PriorOptions(prior="table"), masks=given.startswith("masks") or given == "no hand")
+    if given == "no hand":
         return object_alone
     if holder == "arm":
         hidden = arm(object_alone, rng, shown=range(FRAMES))
     else:
         hidden = replace(object_alone, others=(gripper(recipe, places),))
-    with_hand = told == "masks with hand"
-    shown = told in {"masks and hand", "hand"}
+    with_hand = given == "masks with hand"
+    shown = given in {"masks and hand", "hand"}
     return replace(
         hidden,
         mask_of=lambda _, own, others: own | others[0] if with_hand else own,
@@ -79,9 +79,9 @@ def stage(shape: str, holder: Holder, told: Told) -> Stage:
     )
 
 
-def outcome(shape: str, holder: Holder, told: Told) -> Outcome:
+def outcome(shape: str, holder: Holder, given: Given) -> Outcome:
     """Build the model of one run and compare it with the truth."""
-    recorded = Recorded(stage(shape, holder, told))
+    recorded = Recorded(stage(shape, holder, given))
     modeler = compose.modeler(recorded, recorded.stage.options, MethodOptions(seed=0), ObjectOptions())
     hidden = _hidden(recorded)
     began = time.perf_counter()
@@ -93,7 +93,7 @@ def outcome(shape: str, holder: Holder, told: Told) -> Outcome:
     error_deg, _ = pose_errors(recorded, last)
     trajectory = last.solution.trajectory
     score = None if last.model is None else f_score(recorded, last.model, trajectory)
-    return Outcome(shape, holder, told, hidden, len(trajectory), error_deg, score, seconds)
+    return Outcome(shape, holder, given, hidden, len(trajectory), error_deg, score, seconds)
 
 
 def _hidden(recorded: Recorded) -> float:
@@ -130,15 +130,15 @@ def table(outcomes: Sequence[Outcome]) -> str:
     """Return a line for each holder and given masks: medians over the shapes, and the worst."""
     lines = [f"{'':26}{'hidden':>8}{'placed':>10}{'rotation, median':>18}{'worst':>8}{'F, median':>11}{'worst':>8}"]
     for holder in HOLDERS:
-        for told in TOLD:
-            some = [one for one in outcomes if one.told == told and one.holder == holder]
+        for given in GIVEN:
+            some = [one for one in outcomes if one.given == given and one.holder == holder]
             if not some:
                 continue
             degrees = [180.0 if one.error_deg is None else one.error_deg for one in some]
             scores = [0.0 if one.f_score is None else one.f_score for one in some]
             placed, frames = sum(one.placed for one in some), FRAMES * len(some)
             lines.append(
-                f"{holder + ', ' + told:26}{np.median([one.hidden for one in some]):8.0%}{f'{placed} / {frames}':>10}"
+                f"{holder + ', ' + given:26}{np.median([one.hidden for one in some]):8.0%}{f'{placed} / {frames}':>10}"
                 f"{np.median(degrees):17.2f}°{max(degrees):7.1f}°{np.median(scores):11.3f}{min(scores):8.3f}"
             )
     return "\n".join(lines)

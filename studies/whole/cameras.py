@@ -37,7 +37,7 @@ class Lens:
     focal_px: float
     """True focal length."""
     distance_m: float
-    """At which the noise is told."""
+    """At which the noise is stated."""
     noise_m: float
     """Standard deviation of depth there, on a surface that faces the camera."""
     bias: float

@@ -84,7 +84,7 @@ class Capture(AbstractSequence):
         return self._frames[index]
 
     def options(self) -> PriorOptions:
-        """Return what is told of the motion."""
+        """Return what is given of the motion."""
         drawn = self.factors
         if not drawn.told:
             return PriorOptions()

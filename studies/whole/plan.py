@@ -74,7 +74,7 @@ class Factors:
     pictures: tuple[int, int, int]
     """Numbers of the photographs on the object, on what is below it and on what is behind it."""
     told: bool
-    """Whether the motion is told."""
+    """Whether the motion is given."""
     intrinsics: str
     """Where they come from."""
     focal_error: float

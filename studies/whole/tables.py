@@ -39,7 +39,7 @@ FACTORS: Final[Mapping[str, Callable[[Factors], str]]] = MappingProxyType(
         "size": lambda f: _SIZE(min(f.size_m, 1.999)),
         "in the image": lambda f: "cut off" if f.cut else _SHARE(f.share),
         "width": lambda f: f"{f.width_px} px",
-        "camera": lambda f: f"{f.camera}, told" if f.kind_told and f.camera == "time of flight" else f.camera,
+        "camera": lambda f: f"{f.camera}, kind given" if f.kind_told and f.camera == "time of flight" else f.camera,
         "noise": lambda f: _NOISE(f.noise),
         "support": lambda f: f.support,
         "wall": lambda f: "none" if not f.wall else "close behind" if f.wall < 0.5 else "far behind",
@@ -48,7 +48,7 @@ FACTORS: Final[Mapping[str, Callable[[Factors], str]]] = MappingProxyType(
         "order": lambda f: f.order,
         "masks": lambda f: f.masks,
         "colour": lambda f: f.colour,
-        "motion": lambda f: "told" if f.told else "not told",
+        "motion": lambda f: "given" if f.told else "not given",
         "intrinsics": lambda f: f.intrinsics,
         "focal length, error": lambda f: _FOCAL(abs(f.focal_error)),
     }
