@@ -27,6 +27,7 @@ from modeler.cli.reading import reading
 from modeler.composition.compose import check_region
 from modeler.composition.options import ObjectOptions
 from modeler.sequences import bundled, open_sequence
+from modeler.sequences.opening import END
 from modeler.types import (
     Failed,
     Fusing,
@@ -104,8 +105,10 @@ def test_frames_that_are_left_out_in_a_row_are_reported_together(capfd: pytest.C
     ]
 
 
-def on_a_terminal(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return what is written to a terminal that is stderr while something is done."""
+def on_a_terminal(
+    act: Callable[[], object], monkeypatch: pytest.MonkeyPatch, heard: Callable[[bytes], object] = bytes
+) -> str:
+    """Return what is written to a terminal that is stderr while something is done; `heard` gets it as it grows."""
     ours, theirs = pty.openpty()
     said = list[bytes]()
 
@@ -113,6 +116,7 @@ def on_a_terminal(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch) ->
         with contextlib.suppress(OSError):  # the other end is closed
             while piece := os.read(ours, 4096):
                 said.append(piece)
+                heard(b"".join(said))
 
     listening = threading.Thread(target=listen)
     listening.start()
@@ -155,9 +159,14 @@ def test_a_terminal_sees_what_to_do_next_while_frames_come(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     growing = shutil.copytree(scene, tmp_path / "box")
-    command = [*COMMAND, "build", str(growing), "--watch", "--idle-s", "3", "--out", str(tmp_path / "run"), *QUICK]
-    said = on_a_terminal(lambda: subprocess.run(command, stderr=sys.stderr, check=True), monkeypatch)
-    assert "next: turn by " in said
+    command = [*COMMAND, "build", str(growing), "--watch", "--idle-s", "100", "--out", str(tmp_path / "run"), *QUICK]
+
+    def end_once_advised(said: bytes) -> None:
+        if b"next: turn by " in said:
+            (growing / END).touch()
+
+    on_a_terminal(lambda: subprocess.run(command, stderr=sys.stderr, check=True), monkeypatch, end_once_advised)
+    assert (growing / END).exists()
 
 
 # Streams, signals and limits.
