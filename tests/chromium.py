@@ -1,7 +1,5 @@
 """Pages in headless Chromium: what they draw, and what they complain of."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import time

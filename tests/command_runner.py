@@ -1,7 +1,5 @@
 """Commands run in this process, and what they say."""
 
-from __future__ import annotations
-
 import os
 import re
 import resource

@@ -1,7 +1,5 @@
 """Stands in for the process that builds a sequence: pairs that take no time, and a book of which were registered."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

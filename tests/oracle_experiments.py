@@ -1,7 +1,5 @@
 """Recordings of a box and methods that know the truth, for tests of experiments."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

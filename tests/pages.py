@@ -1,7 +1,5 @@
 """README and guide, taken apart into what a reader may try: commands, files and Python."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every prior, and combinations of them, between two small views; all of it can be moved to another camera frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Runs streamed to a recording, and the recording read back."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Marks long lists of cases: some of them in every run of the tests, the rest in `make test-slow`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

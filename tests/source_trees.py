@@ -1,7 +1,5 @@
 """The program's own source files, each parsed once."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from functools import cache

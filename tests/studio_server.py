@@ -1,7 +1,5 @@
 """`modeler studio` in a process of its own, and a browser that looks at it."""
 
-from __future__ import annotations
-
 import http.client
 import os
 import re

@@ -1,7 +1,5 @@
 """Convex bodies on a table before a fixed camera, cast exactly: depth, mask, colour and normals of every pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The ablation study: every variant registers a pair, and its table marks what differs by more than chance."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The study that halves and doubles every named number."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The demonstration of suggestions: a robot that does what is suggested, from its first view to a run folder."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

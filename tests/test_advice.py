@@ -1,7 +1,5 @@
 """What to try next where a model is not to be trusted: by the reason, and by the limit that was hit."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

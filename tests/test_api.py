@@ -1,7 +1,5 @@
 """What `import modeler` offers."""
 
-from __future__ import annotations
-
 import doctest
 import inspect
 import json

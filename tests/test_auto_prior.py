@@ -1,7 +1,5 @@
 """The prior by which an object may stay on its table, and limits that hold only where they were not left already."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Masks by depth that hold more than the object, and what the colours of the static background take off them."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import pytest

@@ -1,7 +1,5 @@
 """The baselines' algebra: where they start, what they match, and in which tangent they state their information."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

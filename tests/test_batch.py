@@ -1,7 +1,5 @@
 """Many sequences: what is done, resumed, tried again and listed, by what is on the disk; and two that are built."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

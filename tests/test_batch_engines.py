@@ -1,7 +1,5 @@
 """Batches on engines that are not always there: a Dask scheduler with two workers as processes, and submitit's jobs."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal

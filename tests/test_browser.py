@@ -1,7 +1,5 @@
 """What a browser makes of the page about a run and of the viewer that the run is streamed to: the model, drawn."""
 
-from __future__ import annotations
-
 import functools
 import http.server
 import shutil

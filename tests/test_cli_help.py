@@ -1,7 +1,5 @@
 """Help says what there is, and nothing else."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

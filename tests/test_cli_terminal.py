@@ -1,7 +1,5 @@
 """What surrounds a command: bars where somebody watches, streams, signals and limits that become no traceback."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty
@@ -205,8 +203,11 @@ def test_messages_that_cannot_be_written_change_no_status(
 @pytest.mark.parametrize(
     ("name", "value"), [("NUMBA_NUM_THREADS", "0"), ("NUMBA_NUM_THREADS", "many"), ("NUMBA_DISABLE_JIT", "1")]
 )
-def test_settings_under_which_nothing_can_be_computed_are_said(name: str, value: str) -> None:
-    assert name in refusal_of(spawned("info", BOX, settings={name: value}))
+def test_settings_under_which_nothing_can_be_computed_are_said(
+    name: str, value: str, monkeypatch: pytest.MonkeyPatch, refusal: Callable[..., str]
+) -> None:
+    monkeypatch.setenv(name, value)
+    assert name in refusal("info", BOX)
 
 
 @pytest.mark.parametrize(
@@ -281,9 +282,8 @@ def test_settings_for_developers_of_libraries_change_nothing(
     ]
 
 
-@pytest.mark.parametrize("files", [8, 20])
-def test_too_few_files_are_said_in_one_line(files: int) -> None:
-    assert "ulimit -n" in refusal_of(spawned("info", BOX, shell=f"ulimit -n {files}; exec"))
+def test_too_few_files_are_said_in_one_line() -> None:
+    assert "ulimit -n" in refusal_of(spawned("info", BOX, shell="ulimit -n 8; exec"))
 
 
 @pytest.mark.parametrize("words", ["info LONG", "report LONG", "build BOX --out LONG", "batch BOX --out LONG"])
@@ -401,9 +401,8 @@ def test_names_that_no_file_can_have_are_refused(
     assert "no file can have this name" in said
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_what_is_wrong_with_an_option_is_said_in_any_encoding(encoding: str) -> None:
-    ended = spawned("build", BOX, "--out", "run", "--sede", "3", settings={"PYTHONIOENCODING": encoding})
+def test_what_is_wrong_with_an_option_is_said_in_any_encoding() -> None:
+    ended = spawned("build", BOX, "--out", "run", "--sede", "3", settings={"PYTHONIOENCODING": "ascii"})
     said = refusal_of(ended)
     assert "--sede" in said
     assert "--seed" in said

@@ -1,7 +1,5 @@
 """Which edges to earlier views are tried: those that are expected to add information, by the shortest paths."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Colour of surface that several views see agrees where it is aligned to depth, and where it is not, this is said."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -65,7 +63,6 @@ def changed(views: dict[int, RayImage], **how: object) -> dict[int, RayImage]:
 
 def colour_fit(views: Mapping[int, RayImage], trajectory: Mapping[int, Array]) -> ColourFit:
     compared = Comparison.of(views, trajectory)
-    assert compared is not None
     return compared.fit()
 
 

@@ -1,7 +1,5 @@
 """Experiments: which pairs are tried, with what, and what errors come of it."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

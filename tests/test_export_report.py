@@ -1,7 +1,5 @@
 """The report: its schema, why a model is not trusted, what a posterior leaves open; what was put in comes back."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

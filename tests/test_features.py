@@ -1,7 +1,5 @@
 """Points recognised by shape: features do not depend on the camera, matches on both sides, motions on noise alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

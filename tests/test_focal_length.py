@@ -1,7 +1,5 @@
 """The focal length as a variable that all edges share: how registrations follow it, and what a graph makes of that."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache

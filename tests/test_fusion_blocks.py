@@ -1,7 +1,5 @@
 """Fusion of many views: in blocks on disk, the same surface, in memory that does not grow with their number."""
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

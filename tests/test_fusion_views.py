@@ -1,7 +1,5 @@
 """Views as fusion takes them: what their pixels weigh, where they see space empty, how far they disagree."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

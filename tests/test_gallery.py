@@ -1,7 +1,5 @@
 """The page about many models, as a browser shows it."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Laws of the pose graph: calibrated poses, closure that helps, and independence of labels, direction and gauge."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A common axis in the graph: derivatives, what it adds, and that it adds no more than it knows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ring_graphs import OBJECT_M, covariance, edge, nees, ring, rotation_error, spin

@@ -1,7 +1,5 @@
 """Cycles: their residuals depend neither on the root of the tree nor on the direction of edges."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which edges count wherever edges are asked, the chain of odometry, and when a loop is closed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

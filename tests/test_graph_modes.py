@@ -1,7 +1,5 @@
 """Posteriors with several modes in the graph: loops and the other edges decide, and what is not decided stays wide."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import final

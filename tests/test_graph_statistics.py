@@ -1,7 +1,5 @@
 """Statistics of solved loops over many seeds: covariances are true before and after closing, lies are found out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

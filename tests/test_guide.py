@@ -1,7 +1,5 @@
 """README and guide: every command is understood, and what they tell a reader to do works, in their order."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """A robot's hand drawn from its poses: what lies within its capsules is marked, what lies before or behind is not."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Folders as other programs write them: what was written is what is read, and what `info` and `convert` make of it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -143,18 +141,6 @@ def test_a_model_is_built_from_any_of_them(tmp_path: Path, frames: list[Frame]) 
     assert set(json.loads((tmp_path / "scene_gt.json").read_text())) == {"0", "1", "2", "3"}
 
 
-def test_real_sequences_survive_the_way_there_and_back(tmp_path: Path) -> None:
-    data = Path(__file__).parents[2] / "shared" / "data"
-    if not data.is_dir():
-        pytest.skip("the real sequences are not here")
-    for name in ("cap", "dragon"):
-        whole = open_sequence(data / name)
-        assert main(["convert", str(data / name), "--every", "12", "--out", str(tmp_path / name)]) == 0
-        again = open_sequence(tmp_path / name)
-        for frame in again:
-            np.testing.assert_allclose(frame.depth_m, whole.frame(frame.index).depth_m, rtol=0, atol=1e-6)
-
-
 def test_the_bundled_sequences_are_found_in_their_folder(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(bundled("box").parent)]) == 2
     assert "box, flashlight, tube" in capsys.readouterr().err
@@ -227,8 +213,3 @@ def test_ranges_of_frames_are_read(text: str, expected: slice) -> None:
 def test_other_ranges_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="A:B"):
         frame_range(text)
-
-
-def test_every_zeroth_frame_is_refused() -> None:
-    with pytest.raises(InputError, match="at least 1"):
-        Numbers(INDICES).select(0)

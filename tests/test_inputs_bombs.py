@@ -1,7 +1,5 @@
 """Inputs that are small on the disk and huge in memory are refused before they are unpacked, in one line."""
 
-from __future__ import annotations
-
 import bz2
 import io
 import json

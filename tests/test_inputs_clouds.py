@@ -1,7 +1,5 @@
 """Organised clouds: the depth image and the camera come back from the points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

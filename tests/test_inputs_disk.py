@@ -1,7 +1,5 @@
 """Disks that are full or closed: one line, and nothing half-written."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Whatever is wrong with folders of pictures is said in one line, and nothing is left behind."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Folders as people have them: images named and stored in ways of other programs, with lenses and masks of theirs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

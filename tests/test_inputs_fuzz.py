@@ -1,7 +1,5 @@
 """Damaged inputs of every format: read, or refused in one line. `python -m studies fuzz` tries many more."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

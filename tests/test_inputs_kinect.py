@@ -1,7 +1,5 @@
 """Recordings as the Azure Kinect writes them: raw 16-bit big-endian depth, JPEG colour, the calibration attached."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Sequences that are short, long, or show something else than one object: a result with its reasons, or one line."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -65,11 +63,12 @@ def doubled(frame: Frame) -> Frame:
     return replace(frame, depth_m=depth_m, mask=None)
 
 
-def test_one_frame_is_a_view_and_no_model_and_two_are_one(frames: list[Frame], tmp_path: Path) -> None:
+def test_one_frame_is_a_view_and_two_are_a_model(frames: list[Frame], tmp_path: Path) -> None:
     status, report = built(frames[:1], tmp_path / "one")
     assert (status, report["complete"]) == (3, True)
     assert any("fewer than two frames" in reason for reason in report["reasons"])
     assert len((tmp_path / "one" / "run" / "trajectory.txt").read_text().splitlines()) == 1
+    assert (tmp_path / "one" / "run" / "model.ply").exists()
     status, report = built(frames[:2], tmp_path / "two")
     assert (status, len(report["poses"]), len(report["edges"])) == (0, 2, 1)
 

@@ -1,7 +1,5 @@
 """Recordings of phones, and what `modeler info` and `modeler build` say of inputs as people have them."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -1,7 +1,5 @@
 """Which pictures belong together, in which order, and what is made of those that do not fit."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

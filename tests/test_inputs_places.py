@@ -1,7 +1,5 @@
 """Paths that hold no sequence, may not be read or written, or are no regular file: one line, and no waiting."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Inputs that are plainly not what they seem are refused in one line, and used on request."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

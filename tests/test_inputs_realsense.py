@@ -1,7 +1,5 @@
 """RealSense: recordings by the maker's own recorder, and a camera that is running."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable

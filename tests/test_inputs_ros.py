@@ -1,7 +1,5 @@
 """ROS 1 and ROS 2 bags and MCAP files: what was recorded is what is read."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import shutil

@@ -1,7 +1,5 @@
 """Measuring a camera's noise on rendered scenes, whose noise is known."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The study of inputs writes what it says: what is right is read whole."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

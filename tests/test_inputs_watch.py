@@ -1,7 +1,5 @@
 """Frames taken while another program writes them."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 import time

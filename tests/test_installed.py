@@ -1,7 +1,5 @@
 """The package as users install it: outside the repository, and on systems other than Linux."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Two runs of one object, upright and lying: joined to one model, exported, and gone on with."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Kernels kept between processes are current and whole, or compiled again."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Rows of a kernel in threads: the same results, whatever the other threads do."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A run that is killed is taken up where it was: the same bytes, and no pair registered twice but the one under way."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Views that match may show different sides that are alike: print tells them apart, and one flat face shows nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What to do next, said while a run goes on."""
 
-from __future__ import annotations
-
 import io
 import threading
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Messages of commands: as many as one wants, all of them in a file, and how long work takes."""
 
-from __future__ import annotations
-
 import logging
 import re
 import time

@@ -1,7 +1,5 @@
 """Models of runs against the true surface: what `modeler evaluate RUN` measures, writes and refuses."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

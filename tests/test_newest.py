@@ -1,7 +1,5 @@
 """A source that is faster than the registration: nothing is lost, and a slow one is followed frame by frame."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

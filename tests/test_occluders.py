@@ -1,7 +1,5 @@
 """What hides the object: neither object nor empty space, whoever says where it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

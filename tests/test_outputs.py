@@ -1,7 +1,5 @@
 """No command writes into or over what it reads, and nothing is replaced unless asked for."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

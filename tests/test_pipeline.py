@@ -45,7 +45,6 @@ from modeler.types import (
     explain,
 )
 from modeler.views import Sensor
-from modeler.views.rays import part_of
 
 BOX = tabletop.Box((0.06, 0.045, 0.08))
 POSES = tabletop.turntable(9)
@@ -485,14 +484,6 @@ def test_what_is_kept_of_a_frame_is_light_and_makes_the_same_view_again() -> Non
         np.testing.assert_array_equal(again.layers[name], layer)
 
 
-def test_frames_of_different_size_make_one_model() -> None:
-    height, width = FRAMES[0].depth_m.shape
-    cut = [part_of(frame, slice(k, height), slice(0, width - 2 * k)) for k, frame in enumerate(COLOURED[:4])]
-    last = run(cut)[-1]
-    assert list(last.solution.trajectory) == [0, 1, 2, 3]
-    assert len(last.model.triangles) > 0
-
-
 @pytest.mark.parametrize("kind", ["nothing measured", "all object", "one pixel", "zero depth", "far apart", "no mask"])
 def test_an_odd_frame_never_stops_the_run(kind: str) -> None:
     frame = FRAMES[2]
@@ -516,14 +507,6 @@ def test_an_odd_frame_never_stops_the_run(kind: str) -> None:
     assert {0, 1, 3, 4} <= set(last.solution.trajectory)
     assert last.model is not None
     assert trajectory_error(last) < 1e-6
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_one_frame_or_two_are_a_sequence(count: int) -> None:
-    last = run(FRAMES[:count])[-1]
-    assert last.last
-    assert list(last.solution.trajectory) == list(range(count))
-    assert last.model is not None
 
 
 @pytest.mark.parametrize(("frames", "given"), [(1, 1), (3, 3), (15, 15), (16, 15), (1000, 15)])

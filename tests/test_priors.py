@@ -1,7 +1,5 @@
 """What every prior must keep: samples follow the density, support is respected, the camera's frame does not matter."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """What single priors know: turntables and their axes, hands, pokes, pace, marked objects, and combinations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

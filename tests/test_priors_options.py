@@ -1,7 +1,5 @@
 """From options and what sequence.json says of the motion to a prior."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

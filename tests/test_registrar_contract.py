@@ -1,7 +1,5 @@
 """What every registration method must keep, whatever it computes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 

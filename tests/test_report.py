@@ -1,7 +1,5 @@
 """The page about a run: whole, true to the run, and in need of nothing else."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Pages of figures are those of their files."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

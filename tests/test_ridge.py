@@ -1,7 +1,5 @@
 """Differences along a ridge: those of both halves of the points are evidence, those of one are chance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

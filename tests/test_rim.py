@@ -1,7 +1,5 @@
 """Depth errors near silhouettes: estimated from matches, and eliminated from their equations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

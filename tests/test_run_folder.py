@@ -1,7 +1,5 @@
 """The run folder: whole, nothing lost unasked, an interrupted run is taken up, a damaged one refused in one line."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -280,12 +278,6 @@ def test_a_report_that_cannot_be_true_is_found_out(folder: Path, damage: Callabl
     assert fault(report) is None
     damage(report)
     assert fault(report) is not None
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"schema": 1, "x": ' + "[" * 100_000 + "]" * 100_000 + "}"])
-def test_a_report_that_is_nested_too_deeply_is_refused(refusal: Callable[..., str], folder: Path, text: str) -> None:
-    (folder / "report.json").write_text(text)
-    refusal("report", folder)
 
 
 def test_a_run_that_is_part_of_itself_is_refused(refusal: Callable[..., str], folder: Path) -> None:

@@ -1,7 +1,5 @@
 """Adaptive importance sampling: its samples stand for the posterior, whatever they were drawn from; mixtures, modes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Inputs cannot make the program run their code, write where it was not asked to, or speak to the terminal."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

@@ -1,7 +1,5 @@
 """The focal length that loops tell."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

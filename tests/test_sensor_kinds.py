@@ -1,7 +1,5 @@
 """What is known of a camera from its kind and from where its intrinsics come."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What the sources keep to: layers, one home for each heavy library, short files, no comparison of arrays."""
 
-from __future__ import annotations
-
 import ast
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """The programs that measure: each is listed and starts, and none relies on tests."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

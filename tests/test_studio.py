@@ -1,7 +1,5 @@
 """What the page stands on: scans, commands and the guard, without a browser."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import random

@@ -1,7 +1,5 @@
 """What is said of the newest view of a capture, and the outline of the next one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page in a real browser: from a capture to an exported model."""
 
-from __future__ import annotations
-
 import json
 import statistics
 import time

@@ -1,7 +1,5 @@
 """`modeler suggest`: what it prints, how it ends, and which files of candidates it takes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What to do next: laws of the predictions, and what they say of objects whose answer is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

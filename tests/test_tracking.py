@@ -1,7 +1,5 @@
 """Frames that are hard to place: cut off by the prior's limits, as it seems, or hidden by something."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import final

@@ -1,7 +1,5 @@
 """Whole runs: exit status 0 for a sound sequence, 3 for the same one with a single fault."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Sequence

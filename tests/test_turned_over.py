@@ -1,7 +1,5 @@
 """An object that is put down otherwise on the way: its segments are found, joined and judged."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Mapping
 from copy import copy

@@ -1,7 +1,5 @@
 """Views on disk are the views that were put there, and the memory of a run does not grow with them."""
 
-from __future__ import annotations
-
 import mmap
 import tempfile
 from dataclasses import replace

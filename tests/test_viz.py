@@ -1,7 +1,5 @@
 """The recording holds what was promised, whatever a run brings."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import math

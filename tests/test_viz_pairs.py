@@ -1,7 +1,5 @@
 """A pair of views is drawn as it was registered: before and after, what each sees, and how sure that is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,11 +1,8 @@
 """No viewer, frozen, closed or absent, can stop a run or outlive it."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
-import resource
 import signal
 import socket
 import struct
@@ -233,16 +230,6 @@ def test_a_recording_that_is_moved_meanwhile_is_written_again_unless_something_e
     assert path.read_bytes() == (b"other" if replaced else moved.read_bytes())
     assert f"{path}: was moved or removed" in caplog.text
     assert ("File exists" in caplog.text) == replaced
-
-
-def test_a_disk_that_fills_before_the_recording_begins_is_said(tmp_path: Path) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        with pytest.raises(viewer.InputError, match=r"r\.rrd: cannot write the recording .*File too large"):
-            open_stream("box", save=tmp_path / "r.rrd")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def closed_port() -> int:

@@ -1,7 +1,5 @@
 """The study of whole builds: captures of another renderer, their truth, and their two halves."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

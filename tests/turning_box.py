@@ -1,7 +1,5 @@
 """A made-up run for tests of sinks: a box turned on a table in front of a camera, seen in exact depth images."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
