@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from modeler.sequences import bundled, open_sequence
+from studies.ablation.constants import builds, masks, pairs
+from studies.ablation.constants.inputs import Footage
 from studies.ablation.constants.source import Number, changed, dependents, numbers_in
 from studies.ablation.constants.tables import RESULTS, on_page, table
 from studies.numbers import table as counts
@@ -96,3 +99,12 @@ def test_rooms_are_counted() -> None:
 def test_the_page_states_the_results() -> None:
     page = Path(__file__).parents[1] / "docs" / "ablation.md"
     assert on_page(page.read_text(), table(RESULTS)) == page.read_text()
+
+
+def test_stages_register_frames_with_the_masks_found() -> None:
+    sequence = open_sequence(bundled("tube"))
+    frames = [sequence.frame(index) for index in sequence.indices[:3]]
+    footage = Footage("tube", frames, truth=sequence.truth(), is_focal_exact=True)
+    masks.masks(footage)
+    assert pairs.pairs([footage])["usable"] == 2.0
+    assert builds.poses(footage)["placed"] == 3.0

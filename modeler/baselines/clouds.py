@@ -219,9 +219,10 @@ class AbstractCloudRegistrar(AbstractRegistrar):
     """A method that aligns point clouds, with the residual-scaled inverse Hessian as its covariance."""
 
     min_points: int = 12
-    """Least number of points of each cloud."""
+    """Least number of points of each cloud: twice as many as a motion has components."""
     min_fitness: float = 0.1
-    """Least fraction of matched points that counts as overlap."""
+    """Least fraction of matched points of whole clouds that counts as overlap: a quarter of what the visibility method
+    requires of the surface that both views should see."""
 
     @abstractmethod
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:

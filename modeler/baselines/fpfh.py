@@ -30,7 +30,7 @@ from modeler.system.processes import install_command
 from modeler.types import Array, InputError, RayImage
 
 _VOXEL = 1 / 40  # edge, as a fraction of the object's size
-_BATCH = 2_000  # draws between evaluations of the stopping rule
+_BATCH = 2_000  # draws between evaluations of the stopping rule: 50 at most
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class FpfhRegistrar(AbstractCloudRegistrar):
     """
 
     reach: float = 1.5
-    """Largest distance of correspondences, in voxels."""
+    """Largest distance of correspondences, in voxels, as in Open3D's tutorial."""
     draws: int = 100_000
-    """Largest number of triangles drawn."""
+    """Largest number of triangles drawn: Open3D's default."""
 
     def fit(self, source: RayImage, target: RayImage, initial: Array, rng: np.random.Generator) -> Fit | None:
         """Return the motion with most inliers among the feature matches."""

@@ -38,9 +38,10 @@ class AbstractMultiscaleRegistrar(AbstractCloudRegistrar):
     voxels: tuple[float, ...] = (1 / 8, 1 / 16, 1 / 32, 1 / 64)
     """Voxel edge at each level, coarse to fine, as a fraction of the object's size."""
     reach: float = 2.0
-    """Largest distance of correspondences, in voxels."""
+    """Largest distance of correspondences, in voxels: at first a quarter of the object's size, as far as a step of 25°
+    moves its rim."""
     iterations: int = 60
-    """Largest number of steps per level."""
+    """Largest number of steps per level: twice Open3D's default."""
 
     def by_levels(self, source: Cloud, target: Cloud, target_from_source: Array, level: Level) -> Fit | None:
         """Return the fit of the finest level, each starting from the result of the coarser; None without any level."""

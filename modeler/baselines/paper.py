@@ -48,11 +48,12 @@ class PaperRegistrar(AbstractRegistrar):
     samples: int | None = None
     """Number of samples of the prior; None = 2·10⁶ of a uniform prior, 2·10⁵ of others, which take longer."""
     points: int = 60
-    """Number of surface points of each view."""
+    """Number of surface points of each view; with more, the weights collapse onto fewer samples."""
     reach_sigmas: float = 4.0
     """Lateral standard deviations beyond which pixels are ignored; at 4, their part of the sum is e⁻⁸."""
     reject_below: float = 1e-6
-    """A sample is rejected if a point's density is below this fraction of that of a hidden point."""
+    """A sample is rejected if a point's density is below this fraction of that of a hidden point, as its weight is
+    negligible."""
     device: gpu.Device = "auto"
     """Device that draws, tests and weights samples."""
 

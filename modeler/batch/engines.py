@@ -174,7 +174,7 @@ def _own(name: str, module: str, attribute: str, workers: int | None) -> Executo
     return executor
 
 
-_RETURNS_S = 120.0  # time to wait for a lost engine
+_RETURNS_S = 120.0  # time to wait for a lost engine, until a network is back
 
 
 def results(

@@ -26,7 +26,7 @@ from modeler.system.regular_files import PIECE_BYTES
 
 BUILDER = "modeler.cli.one_job"  # module that builds the sequence of a job, in a process of its own
 NOTES = ".batch"  # subfolder of a batch with the state of each sequence and the output of its build
-TRIES = 2  # how often a sequence that fails is tried
+TRIES = 2  # how often a sequence that fails is tried: once more, in case the machine was at fault
 ENDED = (0, 3)  # statuses of completed builds
 Standing = Literal["new", "interrupted", "done", "changed", "other", "failed"]
 _MOST = 1 << 31  # of a number in it

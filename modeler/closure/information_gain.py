@@ -49,7 +49,7 @@ class InformationGain:
     """Whether an edge joins the new view to `previous`; False: it is `previous`."""
     power: float = 2.0
     """Exponent of cos θ in the information of an edge over a rotation θ. A larger one prefers small rotations, which
-    have less systematic error."""
+    have less systematic error. Halved or doubled, builds of the dragon and of cap are the same."""
 
     @cached_property
     def paths(self) -> ShortestPaths:

@@ -154,7 +154,8 @@ def _box_centre(points: Array) -> Array:
     return 0.5 * (points.min(axis=0) + points.max(axis=0))
 
 
-_LEAST_BACK = 0.3  # least horizontal part of the direction to the camera: else it looks straight down
+_LEAST_BACK = 0.3
+"""Least horizontal part of the direction to the camera: within 17° of the vertical it looks straight down."""
 _WIDE, _FLAT = 0.1, 0.3  # a ring is no line, and all but plane
 
 UpSource = Literal["support", "ring", "camera"]

@@ -34,7 +34,7 @@ from modeler.types import Array, BoolArray, InputError, ObjectModel, RayImage
 # average blurs. Chosen by hand.
 SOFT, SHARP = 4.0, 16.0
 CONFIRMED = 2  # views that see the same surface: thin parts that one view alone sees are errors along its outline
-HALVES = np.array([0.36, 0.48, 0.8])  # divides directions in two halves; chosen by hand, along no axis
+HALVES = np.array([0.36, 0.48, 0.8])  # a direction that divides others in two halves: any one along no axis
 MIN_NEIGHBOURS = 6  # points of the cloud with fewer in 27 cells of two voxels are outliers; a plane has some 36
 PREVIEW_VIEWS, PREVIEW_POINTS = 100, 60_000  # at most: more take longer, and look the same
 FINEST_PX = 0.01  # smallest voxel, in pixel footprints: a hundred voxels per pixel resolve nothing
@@ -53,22 +53,28 @@ class Fuser:
     max_voxels: int = 192**3
     """Memory bound: voxels are enlarged until the object's box holds at most this many."""
     min_cosine: float = 0.15
-    """Surface points seen at a smaller cosine between normal and ray (81°) are not used."""
+    """Surface points seen at a smaller cosine between normal and ray (81°) are not used. With 0.3, 0.57 instead of
+    0.58 % of the box's surface lie in free space."""
     edge_weight: float = 0.1
-    """Weight of pixels next to a silhouette or depth step, relative to 1: they mix foreground and background."""
+    """Weight of pixels next to a silhouette or depth step, relative to 1: they mix foreground and background. With 0.05
+    and 0.2, 0.54 and 0.69 % of the box's surface lie in free space, not 0.58."""
     margin_px: int = 2
     """A pixel carves only as deep as all its neighbours within this distance at most, which preserves silhouettes; in
     views of well-known poses within 1 px."""
     empty_weight: float = 0.3
-    """Weight of a view that sees a voxel as free space, relative to 1 for a view that sees surface there head-on."""
+    """Weight of a view that sees a voxel as free space, relative to 1 for a view that sees surface there head-on. With
+    0.15 and 0.6, left-out views of the box are as far away to 0.2 %."""
     min_support: float = 0.03
-    """Smallest sum of view weights of a mesh vertex."""
+    """Smallest sum of view weights of a mesh vertex. With 0.015 and 0.06, 0.68 and 0.54 % of the box's surface lie in
+    free space, not 0.58."""
     closing: int = 3
-    """Gaps narrower than about twice this many voxels are closed; wider unseen regions stay open."""
+    """Gaps narrower than about twice this many voxels are closed; wider unseen regions stay open. With 2 and 6, 0.56
+    and 0.72 % of the box's surface lie in free space, not 0.58."""
     opening: int = 2
-    """Spikes and strips along open borders narrower than about twice this many voxels are removed."""
+    """Spikes and strips along open borders narrower than about twice this many voxels are removed. With 1 and 4, 0.62
+    and 0.51 % of the box's surface lie in free space, not 0.58."""
     fairing: int = 10
-    """Passes of Taubin smoothing."""
+    """Passes of Taubin smoothing. With 5 and 20, left-out views of the box are as far away to 0.3 %."""
 
     def fuse(
         self,

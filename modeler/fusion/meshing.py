@@ -136,17 +136,28 @@ Triangles = npt.NDArray[np.int64]
 
 # Chosen by hand where nothing else is said.
 RAYLEIGH_MEDIAN = 1.1774  # of the length of two independent normal variables of variance 1
-COLOUR_NEIGHBOURS = 6  # vertices whose colours are interpolated where none was observed
-NORMAL_NEIGHBOURS = 12  # supported vertices whose normals are compared with an unsupported one's
-FOLD_RAD = 0.7  # a surface that turns by more within a few voxels folds over
-WEAK = 0.2  # vertices with less than this share of the median support are weak
-WEAK_PASSES = 40  # of smoothing weak vertices
+COLOUR_NEIGHBOURS = 6
+"""Vertices whose colours are interpolated where none was observed: those around a vertex of a regular mesh."""
+NORMAL_NEIGHBOURS = 12
+"""Supported vertices whose normals are compared with an unsupported one's; with 24, the box is the same."""
+FOLD_RAD = 0.7
+"""A surface that turns by more within a few voxels folds over; with 0.35 and 1.4, 0.55 and 0.60 % of the box lie in
+free space."""
+WEAK = 0.2
+"""Vertices with less than this share of the median support are weak; with 0.1 and 0.4, 0.59 % of the box lie in free
+space."""
+WEAK_PASSES = 40  # of smoothing weak vertices; with 20 and 80, 0.59 % of the box lie in free space, with 40 0.58
 PASSES = 60  # of fitting vertices to normals, and of smoothing unseen ones: with half as many, a box is 0.2 % larger
 PINCH_DEPTH = 1e-2  # how far inside a voxel is put to resolve a pinch, in voxels
 EDGE = 4.685  # sd of the differences between neighbouring normals that make an edge: Tukey's, of 95 % efficiency
-FLATTENING_PASSES = 50  # at most, of the smoothing that shows how smoothed views flatten surface
-GUIDE_PASSES = 10  # of smoothing normals before edges are sought
-DIFFUSION_PASSES = 200  # of normals over neighbouring triangles: some 15 triangles far
+FLATTENING_PASSES = 50
+"""At most, of the smoothing that shows how smoothed views flatten surface: it ends where it has spread as far as
+theirs."""
+GUIDE_PASSES = 10
+"""Of smoothing normals before edges are sought: some three triangles far; insensitive, as `DIFFUSION_PASSES`."""
+DIFFUSION_PASSES = 200
+"""Of normals over neighbouring triangles, some 15 of them far; with 100 or 400, left-out views of the box differ by
+1.5 %."""
 
 
 def without_pinches(field: DistanceField) -> DistanceField:

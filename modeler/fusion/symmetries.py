@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ORDERS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 16)
 """Orders n of rotations by 360°/n that are tried about the likely axes; about the others, 2 and 3."""
 _MOST = 59  # rotations of a finite group, but for those about one axis (an icosahedron's): more belong to a ball
-_LIKELY = 6
+_LIKELY = 6  # axes of a kind: a cube has six twofold ones
 _NEAR = (0.2, 0.3, 0.5, 0.6, 0.7)  # of the points, within three tolerances at each step of ICP: else it is given up
 _SMALL_DEG = (5.0, 8.0, 12.0)  # turns that bring up little of what was not seen, and map no n-fold shape onto itself
 _PAINTED = 40_000  # points whose colours are looked up: 0.7 % of the diameter apart on a cube, of 1 % that is tolerated
@@ -100,19 +100,20 @@ class SymmetryFinder:
     least_share: float = 0.01
     """Least tolerance, as a share of the diameter: smaller details do not help a pose estimator."""
     elsewhere: float = 0.006
-    """Largest share of points farther than the tolerance from the surface, which allows for outliers."""
+    """Largest share of points farther than the tolerance from the surface, which allows for outliers: twice what 3 sd
+    of noise leave."""
     unknown: float = 0.1
     """Largest share of points that end where nothing was seen."""
     repainted: float = 0.05
     """Largest share of points that find no place of like colour within the tolerance."""
     colour_tolerance: float = 10.0
-    """Distance of like colours in CIELAB."""
+    """Distance of like colours in CIELAB: some four just noticeable differences."""
     points: int = 4000
-    """Points that are compared."""
+    """Points that are compared: the standard deviation of a share of 0.006 is then 0.0012."""
     icp_points: int = Matcher.points
     """Points used by ICP."""
     directions: int = 24
-    """Directions spread evenly over half a sphere."""
+    """Directions spread evenly over half a sphere, about 30° apart."""
 
     def find(
         self,

@@ -14,11 +14,15 @@ from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
 
 # All chosen by hand.
-ROUNDS = 400  # of the primal-dual iteration
+ROUNDS = 400  # of the primal-dual iteration; with 200, the closed box has 0.3 % less volume, with 800 the same
 SEAM = 4  # passes over the seam between seen and unseen surface, and rings next to it that are smoothed like weak ones
-OUTVOTED = 0.1  # largest share of the views of a cell that may be wrong, for their poses err
-OUTER_LAYERS = 3  # layers of voxels at the border of the grid that are outside
-BELOW_PLANE = 0.01  # largest share of surface points below the plane on which the object stands
+OUTVOTED = 0.1
+"""Largest share of the views of a cell that may be wrong, for their poses err; with 0.05 the box is the same, with 0.2
+0.2 % larger."""
+OUTER_LAYERS = 3  # layers of voxels at the border of the grid that are outside: those that it is wider than the surface
+BELOW_PLANE = 0.01
+"""Largest share of surface points below the plane on which the object stands: of noise; halved or doubled, the box is
+the same."""
 
 
 def without_rejected(field: DistanceField, rejected_m: Array, kept_m: Array, reach_m: float) -> DistanceField:

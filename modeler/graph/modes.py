@@ -21,7 +21,9 @@ from modeler.significance import SELDOM
 from modeler.types import Array, Edge
 
 _BEAM = 4096  # hypotheses kept while loops are added one by one: all of twelve edges with two modes
-_MAX_EXTRA_OUTLIERS = 1.5  # outlier loops more than the best hypothesis before one is dropped: one loop may be wrong
+_MAX_EXTRA_OUTLIERS = 1.5
+"""Outlier loops more than the best hypothesis before one is dropped: one loop may be wrong. Halved or doubled, the
+dragon's poses are the same."""
 
 
 @dataclass(frozen=True, eq=False)

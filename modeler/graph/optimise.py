@@ -23,7 +23,9 @@ from modeler.types import Array
 
 _ANCHOR_SIGMA = 1e-6  # rad and m, of the root: far below any registration's
 _RELINEARISE = 1e-3  # rad and m from the linearisation point: relative error of a factor's residual
-_WILDFIRE = 1e-5  # changes in rad and m below which iSAM2 stops back substitution
+_WILDFIRE = 1e-5
+"""Changes in rad and m below which iSAM2 stops back substitution; halved or doubled, the dragon's poses are the
+same."""
 MAX_ROUNDS = 8  # of whatever iterates over solutions; if more are needed, the initial value was too far off
 CONDENSED_FROM = 1000  # frames: below, condensing saves nothing
 _RENEWED_AT = 256, 16  # frames since a graph was condensed, at least and as a share of all, with which it is so again

@@ -42,11 +42,12 @@ from modeler.types import (
     spread,
 )
 
-ALIGNMENT_SIGMA_RAD = 0.12  # standard deviation of the alignment of a model with another, or with a frame
+ALIGNMENT_SIGMA_RAD = 0.12
+"""Standard deviation of the alignment of a model with another, or with a frame: half of `SEPARATE_RAD`."""
 ALIGNMENT_SIGMA = 0.15  # of its shift, in units of the object's size
-_MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment; beyond, it is at another mode
-_MIN_ALIGNMENTS: Final = 4  # about which pairs of views are registered
-_MAX_ALIGNMENTS: Final = 24  # as many ways has a cube to match its shape, of which print tells one
+_MAX_DEVIATION_RAD = 0.5  # of a posterior from the alignment, four standard deviations; beyond, it is at another mode
+_MIN_ALIGNMENTS: Final = 4  # about which pairs of views are registered: in as many ways does a box match its shape
+_MAX_ALIGNMENTS: Final = 24  # as many ways has a cube to match its shape, of which print singles out one
 _CLOSE_NATS: Final = 10.0  # to the likeliest: registering gains a right alignment up to 5, and others are 50 below
 MIN_JOINS: Final = 2
 """Pairs of views that must agree on an alignment: nothing confirms a single one."""
@@ -105,7 +106,7 @@ class Joiner:
     ready: Callable[[RayImage], RayImage] = lambda view: view
     """Returns a view with the images that a likelihood looks up."""
     pairs: int = 6
-    """Number of pairs of views to register, one of each segment."""
+    """Number of pairs of views to register, one of each segment: `MIN_JOINS` of them must agree, and some fail."""
     sigma_rad: float = ALIGNMENT_SIGMA_RAD
     """Standard deviation of the rotation of an alignment about which pairs are registered."""
 

@@ -16,7 +16,7 @@ from modeler.types import Array, PoseGaussian, Posterior
 _MAX_PAIRS = 60  # of many, the latest suffice
 MIN_TURN_RAD = np.radians(5.0)  # below, a turn says little of its axis
 _FREEDOM = 5.0  # degrees of freedom of Student's t: few, so that outliers count little
-_ITERATIONS = 30
+_ITERATIONS = 30  # at most, of reweighting: it ends where the axis settles
 UNDECIDED = 1.0 / 500.0  # by three certain pairs it is 9⁻³ = 1 / 729
 """Probability of the opposite sense below which the sense counts as known, and which it then has."""
 _MAX_LOG_ODDS = np.log(9.0)  # bound on the log odds of one pair, which may have missed the true mode

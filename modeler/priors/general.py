@@ -11,7 +11,8 @@ from modeler.priors.mixtures import directions
 from modeler.types import AbstractPoseDensity, AbstractPrior, Array, RayImage, checked
 from modeler.types.base import MAX_LENGTH_M, check_parameters
 
-_SMALL_DEG = 30.0  # turn up to which the limit of the centroids' offset is used as given
+_SMALL_DEG = 30.0
+"""Turn up to which the limit of the centroids' offset is used as given: more than the usual step of 25°."""
 LARGE_DEG = 75.0  # a sphere turned so far shows (1 + cos 75°) / 2 = 63 % of its surface seen before
 _OFFSET_SHARE = 0.75  # of the object's size: 4 to 6 cm for boxes, bottles and caps of 15 to 20 cm on a turntable
 _LEAST_SIZE_M = 1e-3  # of an object: that of a single point is 0
@@ -23,7 +24,7 @@ _MARGIN_DEG = 5.0  # of limits around confident proposals: they bound the search
 class GeneralPrior(AbstractPrior):
     """Any rotation up to a limit, with the centroids of the two surfaces close to each other."""
 
-    max_rotation_deg: float = 50.0
+    max_rotation_deg: float = 50.0  # two of the usual steps of 25°
     """Largest rotation between the two views."""
     max_offset_m: float | None = None
     """Largest distance between the target's centroid and the source's, transformed; None: 0.75 of the object's size."""

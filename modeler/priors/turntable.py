@@ -256,7 +256,7 @@ class TurntablePrior(AbstractPrior):
 
     step_deg: float
     """Turn from one frame number to the next; negative: left-handed."""
-    step_sigma_deg: float = 1.0
+    step_sigma_deg: float = 1.0  # as marks of a turntable are met by hand
     """Standard deviation of one step."""
     step_sign: Literal["known", "unknown"] = "known"
     """Whether the sign of the step is known; unknown: either sense, until several pairs determine it."""
@@ -267,7 +267,7 @@ class TurntablePrior(AbstractPrior):
     axis_sigma_deg: float | None = None
     """Standard deviation of the axis' direction. None: 1 if it is given, the plane's own if a table is seen, else 30
     about the camera's up (-y). 180 or more: any direction."""
-    axis_sigma_m: float = 0.005
+    axis_sigma_m: float = 0.005  # halved or doubled, log densities are the same
     """Standard deviation of the axis' point, orthogonal to the axis, if one is given."""
     max_shift_m: float | None = None
     """Largest distance, orthogonal to the axis, between the target's centroid and the source's, transformed; it grows

@@ -11,13 +11,14 @@ from modeler.se3 import rows
 from modeler.types import AbstractPoseDensity, Array, Outcome, PoseGaussian, Posterior, RayImage
 
 FLOOR = np.diag(np.repeat([1e-6, 1e-7], 3) ** 2)
-"""Added to sample covariances (6, 6) of ξ (rad, m), so that they are positive definite."""
+"""Added to sample covariances (6, 6) of ξ (rad, m), so that they are positive definite: a thousandth of a
+registration's."""
 NEGLIGIBLE_VARIANCE = 1e-4
 """Relative to what is expected: a hundredth of a standard deviation, as of images without noise."""
 MIN_MODE_SHARE = 0.005
-"""Modes of less posterior probability are negligible."""
+"""Modes of less posterior probability are negligible: three that are left out hold 1.5 %."""
 PRIOR_SAMPLES = 500
-"""Samples of a prior, for its mean and covariance."""
+"""Samples of a prior, for its mean and covariance: a standard deviation is then known to 3 %."""
 
 
 def weighted_gaussian(poses: Array, weights: Array, centre_m: Array) -> PoseGaussian:

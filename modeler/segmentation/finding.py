@@ -28,13 +28,16 @@ from modeler.segmentation.scene import Scene
 from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, Plane
 
 Window = tuple[slice, slice]
-_ZONE_MARGIN_SHARE = 0.3  # share of the zone's size, if that is more
+_ZONE_MARGIN_SHARE = 0.3
+"""Share of the zone's size, if that is more; with 0.15 and 0.6, masks have an IoU of 0.999 with these."""
 _ZONE_MARGIN = 0.14  # distance from the object's zone at which it may still be, as a share of its distance
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
 _MOVED = 0.028  # of an object's outline between the frames from which its scene is learned, as a share of its distance
 _GAP_FLOORS = 15.0  # least gap in noise floors, 12 mm: nearby, the parts of a plush toy are as far apart
 _CREASE = 0.014  # creases of the support are at most so high, and so far from the object, as a share of its distance
-AREA_FACTOR = 2.5  # factor by which the visible area may leave its range in the scene
+AREA_FACTOR = 2.5
+"""Factor by which the visible area may leave its range in the scene; with 1.25 a plant's mask is unsure, with 5
+none."""
 
 
 @dataclass(frozen=True, eq=False)

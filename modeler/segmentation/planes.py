@@ -18,7 +18,9 @@ Real = TypeVar("Real", bound=np.floating[Any])
 # cameras, differ by 3, 4 and 13 mrad.
 _SYSTEMATIC_TILT_RAD = 0.005
 _SYSTEMATIC_SHARE = 0.0015  # error of the plane's distance that its residuals do not show, and of the depth's scale
-_BLOCKS_ACROSS = (3, 6, 12)  # numbers of blocks along the longer side: correlation lengths that are tried
+_BLOCKS_ACROSS = (3, 6, 12)
+"""Numbers of blocks along the longer side: correlation lengths that are tried. Halved or doubled, masks of ten
+sequences are the same."""
 _MAX_HYPOTHESES = 200
 _MOST_PLANES = 10
 LEAST_SHARE: Final = 0.006

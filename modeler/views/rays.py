@@ -154,7 +154,7 @@ class Sensor:
     min_cosine: float = 0.35
     """Least cosine between normal and viewing ray: surface seen at a flatter angle gives no points."""
     max_silhouette_px: float = 60.0
-    """Distance from the silhouette at which its transform is cut off."""
+    """Distance from the silhouette at which its transform is cut off: errors there have fallen to e⁻⁶."""
 
     def measured(self, noise: RangeNoise | None) -> Sensor:
         """Return the sensor with what a scene shows of how its errors are alike; None where it shows nothing."""

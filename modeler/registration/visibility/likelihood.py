@@ -32,7 +32,8 @@ from modeler.types import Array, RayImage
 
 _ROUNDING_M = 1e-6  # of depths in single precision: planes without noise may match exactly
 MIN_MATCHES = 20
-"""Fewer matches, or points, do not determine the nuisance parameters."""
+"""Fewer matches, or points, do not determine the nuisance parameters: of 20, a variance has a relative standard
+deviation of 0.3."""
 DESCENT_STRIDE = 4
 """Every fourth point is used for descent."""
 
@@ -64,21 +65,25 @@ class VisibilityLikelihood:
     """Parameters of the likelihood: surface that faces a camera is seen by it, other surface is hidden."""
 
     points: int = 600
-    """Number of surface points of each view for search and sampling."""
+    """Number of surface points of each view for search and sampling; another choice of them moves results by 0.2 to 0.3
+    standard deviations."""
     refining_points: int = 2400
-    """Number of surface points of each view for refinement."""
+    """Number of surface points of each view for refinement; 10,000 are no better."""
     surface_noise: float = 0.1
-    """Least noise of smoothed surfaces, common to neighbours, as a fraction of the sensor's range noise."""
+    """Least noise of smoothed surfaces, common to neighbours, as a fraction of the sensor's range noise; without it, 6
+    of 30 right pairs of a dog are rejected."""
     surface_detail: float = 0.003
-    """Least error of local planes on a curved surface, as a fraction of the object's size."""
+    """Least error of local planes on a curved surface, as a fraction of the object's size; halved or doubled, 68 pairs
+    are as good."""
     hidden_share: float = 0.5
-    """Prior probability η that a point that faces the other camera is hidden by another part of the object."""
+    """Prior probability η that a point that faces the other camera is hidden by another part of the object. With 0.25
+    and 0.75, NEES/6 of 710 pairs is 1.14 and 1.02, with 0.5 1.08."""
     holes: bool = True
     """Whether points that should be seen where nothing was measured are evidence (method, eq. 4.4)."""
     max_point_cost: float = 10.0
-    """Upper bound K (nats) of the cost of one point."""
+    """Upper bound K (nats) of the cost of one point; halved or doubled, 68 pairs are as good."""
     normal_cost: float = 2.0
-    """Cost κ (nats) of a match whose normals are at right angles."""
+    """Cost κ (nats) of a match whose normals are at right angles; halved or doubled, 68 pairs are as good."""
     max_independent: float = 300.0
     """Largest number of independent measurements in the points of both views, limited by common errors."""
     max_independent_colours: float = 140.0
@@ -88,9 +93,10 @@ class VisibilityLikelihood:
     """The same for colours that are noise. Under wrong poses, correlations in the finest band scatter about their mean
     as those of 200 to 1,000 independent features, on drawn bodies with print and without."""
     no_overlap_cost: float = 50.0
-    """Cost (nats) of a pose under which no surface matches."""
+    """Cost (nats) of a pose under which no surface matches; with half, 12 of 100 pairs fail, not 5, and twice as much
+    changes nothing."""
     overlap_scale: float = 0.1
-    """Fraction of matching points at which that cost has fallen to 1/e."""
+    """Fraction of matching points at which that cost has fallen to 1/e; halved or doubled, 68 pairs are as good."""
     colour: bool = True
     """Whether the colours of matching surface are compared, if both frames have them."""
 

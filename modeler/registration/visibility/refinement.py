@@ -31,9 +31,11 @@ class Refiner:
     """Moves the samples of a tempered posterior by the information of matching surface."""
 
     patches: int = 32
-    """Number of parts into which the surface is bisected, whose errors are assumed independent: a power of two."""
+    """Number of parts into which the surface is bisected, whose errors are assumed independent: a power of two. With 16
+    and 64, NEES/6 of 68 pairs is 1.17 and 0.98, with 32 1.02."""
     min_matches: float = 6.0
-    """Least mean number of matches in a patch; with fewer in all, there are fewer patches."""
+    """Least mean number of matches in a patch, as many as a motion has components; with fewer in all, there are fewer
+    patches."""
 
     def refine(
         self,

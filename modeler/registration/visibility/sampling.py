@@ -220,7 +220,8 @@ class AdaptiveSampler:
     """
 
     draws: int = 200
-    """Least samples per round; regions that the first round misses may also be missed by later ones."""
+    """Least samples per round; regions that the first round misses may also be missed by later ones. With 400, as long,
+    with 100 1.4 times."""
     samples: int = 300
     """Effective sample size at which the rounds end, and largest number of samples in the result: means scatter by 0.06
     sd, a fifth of what the choice of points moves them by."""

@@ -1,4 +1,4 @@
-"""Halve and double each named number of segmentation, fusion, closure, graph and priors, on captures and renderings.
+"""Halve and double each named number of the rooms that make a model, on captures and renderings.
 
     python -m studies ablation.constants                    what is not measured yet, hours on one core
     python -m studies ablation.constants --condense         what has been measured, into the result file of the page

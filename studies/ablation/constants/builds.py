@@ -10,10 +10,9 @@ from modeler.fusion import Fuser
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior, TurntablePrior
 from modeler.registration import VisibilityRegistrar
-from modeler.segmentation import Scene
 from modeler.types import NOMINAL_FOCAL, SensorNoise, Solution, Step
 from modeler.views import Sensor
-from studies.ablation.constants.inputs import Figures, Footage, GivenMasks, Recalling, digest
+from studies.ablation.constants.inputs import Figures, Footage, Recalling, digest
 
 
 def poses(footage: Footage) -> Figures:
@@ -28,16 +27,14 @@ def poses(footage: Footage) -> Figures:
 
 def run(footage: Footage) -> Step:
     """Return the last step of a build."""
-    found = {frame.index: one for frame, one in zip(footage.frames, footage.found, strict=True)}
     modeler = Modeler(
-        segmenter=GivenMasks(found),  # pyright: ignore[reportArgumentType]
         sensor=Sensor() if footage.is_focal_exact else Sensor(SensorNoise(sigma_focal=NOMINAL_FOCAL)),
         prior=AutoPrior() if footage.step_deg is None else TurntablePrior(footage.step_deg, axis_sigma_deg=30.0),
         registrar=Recalling(VisibilityRegistrar()),
         fuser=Fuser(max_voxels=24**3),
     )
     last = None
-    for event in modeler.run(footage.frames, Scene()):
+    for event in modeler.run(footage.masked, modeler.segmenter.scene(footage.masked)):
         last = event if isinstance(event, Step) else last
     assert last is not None
     return last

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 from modeler.types import (
@@ -45,6 +45,11 @@ class Footage:
     found: list[Segmentation] = field(default_factory=list)
     """With the default numbers."""
 
+    @property
+    def masked(self) -> list[Frame]:
+        """The frames with the masks found, as given ones."""
+        return [replace(frame, mask=one.mask) for frame, one in zip(self.frames, self.found, strict=True)]
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -55,19 +60,6 @@ class Posed:
     views: Mapping[int, RayImage]
     trajectory: Mapping[int, Array]
     covariances: Mapping[int, Array]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class GivenMasks:
-    """A segmenter that returns what was found before."""
-
-    found: Mapping[int, Segmentation]
-
-    def segment(self, frame: Frame, scene: object) -> Segmentation:
-        """Return the segmentation of a frame by its number."""
-        del scene
-        return self.found[frame.index]
 
 
 @final

@@ -29,6 +29,7 @@ STAGES: Final = {
     "closed": "surfaces",
     "symmetries": "surfaces",
     "alignment": "surfaces",
+    "pairs": "pairs",
     "poses": "builds",
     "densities": "densities",
 }
@@ -36,7 +37,7 @@ STAGES: Final = {
 _FACTORS: Final = (0.5, 2.0)
 Case = tuple[str, str]
 """A stage and the name of its input."""
-ROOMS: Final = ("segmentation", "fusion", "closure", "graph", "priors")
+ROOMS: Final = ("segmentation", "fusion", "closure", "graph", "priors", "views", "registration")
 _LONGEST: Final = 6.0  # times as long as with the default numbers, and
 _LONGEST_S: Final = 20.0  # so many seconds more, after which a variant is given up
 
@@ -58,6 +59,10 @@ def cases(data: Path, bundled: Path, rooms: Sequence[str] = ROOMS, *, few: bool 
         found |= {
             (stage, "box"): box for stage in ("densities", "surface", "preview", "closed", "symmetries", "alignment")
         }
+    if {"views", "registration"} & set(rooms):
+        found["pairs", "six sequences"] = _pairs(data, bundled)
+    if set(rooms) <= {"segmentation", "views", "registration"}:
+        return found  # which no whole build measures
     if {"closure", "graph", "priors"} & set(rooms) or not few:
         found["poses", "dragon"] = _footage(data / "dragon", "dragon", slice(None), exact=True)
     if not few:
@@ -95,6 +100,18 @@ def _masks(data: Path, bundled: Path, *, few: bool) -> dict[Case, Any]:
     return found
 
 
+def _pairs(data: Path, bundled: Path) -> list[inputs.Footage]:
+    """Return the frames whose pairs are registered, with the masks that the default numbers find."""
+    from studies.ablation.constants import masks
+
+    found = [_footage(bundled / name, name, slice(3)) for name in ("box", "tube")]
+    for name, some in _PAIRS:
+        found.append(_footage(data / name, name, some, exact=name == "dragon"))
+    for footage in found:
+        masks.masks(footage)
+    return found
+
+
 def _posed(folder: Path) -> inputs.Posed:
     """Return the first views of a rendered sequence with their true poses."""
     from modeler import se3
@@ -129,6 +146,14 @@ _MASKS: Final = (
     ("carton", 4, 5),
 )
 """Captures, every how manyth of their frames, and how many at most."""
+_PAIRS: Final = (
+    ("dragon", slice(3)),
+    ("dragon", slice(0, 6, 2)),
+    ("bear", slice(3)),
+    ("kleenex", slice(0, 6, 2)),
+    ("cap", slice(0, 6, 2)),
+)
+"""Captures with reference poses, and which of their frames follow each other."""
 STEP_KNOWN: Final = "tube, step known"
 """A rendered sequence under the prior of a turntable, which only that prior's numbers change."""
 
@@ -163,6 +188,8 @@ def stages_of(number: Number, names: Sequence[tuple[str, str]]) -> list[tuple[st
             wanted = ("preview",) if number.name.startswith("PREVIEW") else ("surface",)
         case "priors", _:
             wanted = ("densities", "poses")  # in this order
+        case "views" | "registration", _:
+            wanted = ("pairs",)
         case _:
             wanted = ("poses",)
     return [one for stage in wanted for one in names if one[0] == stage]

@@ -31,6 +31,9 @@ _FIGURES: Final = {
     "placed": "frames placed",
     "edges": "edges",
     "taking_part": "that take part",
+    "usable": "usable pairs",
+    "largest_deg": "largest error, °",
+    "nees": "NEES/3",
 }
 _NO_FIGURES: Final = ("number", "factor", "stage", "input", "digest", "seconds")
 _TOLERANCE: Final = 1e-3  # relative, below which figures count as the same
