@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 from command_runner import QUICK, Run, refusal_of
 from fake_builder import PATIENCE_S, book, run_here, sequence, started, wait_for
@@ -20,7 +21,7 @@ from slow_cases import quick_first
 
 from modeler.batch import engines, jobs
 from modeler.batch.jobs import NOTES, Job, fingerprint, standing
-from modeler.batch.models import TABLE, models_in, read_table, write_models
+from modeler.batch.models import TABLE, models_in, write_models
 from modeler.cli import parsed
 from modeler.cli.manifest import Row, named, read_manifest
 from modeler.types import InputError
@@ -38,7 +39,7 @@ def _stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def rows(out: Path) -> dict[str, dict[str, Any]]:
-    return {row["name"]: row for row in read_table(out / TABLE)}
+    return {row["name"]: row for row in pq.read_table(out / TABLE).to_pylist()}
 
 
 def test_each_sequence_is_built_once_and_its_status_is_kept(cli: Run, tmp_path: Path) -> None:
@@ -411,12 +412,6 @@ def test_the_input_is_recognised_by_its_content(tmp_path: Path) -> None:
         contents.append(fingerprint(job, content=True))
     assert len(set(contents)) == 5
     assert standing(job) == "new"
-
-
-def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
-    (tmp_path / TABLE).write_text("no table")
-    with pytest.raises(InputError, match="not a list of models"):
-        read_table(tmp_path / TABLE)
 
 
 def test_a_manifest_may_come_from_a_spreadsheet_and_say_what_its_input_does_not(tmp_path: Path) -> None:

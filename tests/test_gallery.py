@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from chromium import Page, needs_chromium, started
 from command_runner import Run
 from PIL import Image
 
 from modeler.batch.jobs import NOTES
-from modeler.batch.models import THUMBNAIL_PX, enclosed_m3, read_table
+from modeler.batch.models import THUMBNAIL_PX, enclosed_m3
 from modeler.sequences.meshes import Mesh
 from modeler.sequences.rendering.shapes import Box
 
@@ -170,7 +171,7 @@ def test_the_list_is_brought_up_to_date_and_a_page_is_kept(cli: Run, folder: Pat
     (folder / "models.parquet").unlink(missing_ok=True)
     out = tmp_path / "page.html"
     assert cli("gallery", folder, "--out", out).status == 0
-    rows = {row["name"]: row for row in read_table(folder / "models.parquet")}
+    rows = {row["name"]: row for row in pq.read_table(folder / "models.parquet").to_pylist()}
     assert len(rows) == COUNT
     assert rows["model-0009"]["failure"] == "no <depth> images"
     assert rows["model-0002"]["width_m"] == pytest.approx(0.074)
@@ -189,7 +190,7 @@ def test_a_model_without_picture_gets_one(cli: Run, built: Path, tmp_path: Path)
     shown = image.min(axis=2) < 240.0
     assert 0.1 < shown.mean() < 0.7
     assert sorted(path.name for path in built.iterdir()) == before
-    (row,) = read_table(tmp_path / "models.parquet")
+    (row,) = pq.read_table(tmp_path / "models.parquet").to_pylist()
     assert (row["name"], row["status"]) == ("run", 0)
     os.utime(tmp_path / NOTES / "run.jpg", (1, 1))  # as if the model had been built anew
     assert cli("gallery", tmp_path, "--overwrite").status == 0

@@ -128,7 +128,7 @@ def test_a_click_finds_the_object_again_after_a_wrong_box(scan: Scan) -> None:
 
 def test_command_lines_that_are_shown_are_understood(scan: Scan) -> None:
     (scan.folder / "run-1").mkdir()
-    scan.choose_prior("turntable", 25.0, 3.0)
+    scan.choose(prior="turntable", step_deg=25.0, step_sigma_deg=3.0)
     jobs = [*scan.build_jobs(), *scan.edit_jobs([1]), scan.calibrate_job("depth"), scan.suggest_job()]
     jobs += [scan.export_job(what, texture=True) for what in ("glb", "stl", "mujoco")]
     for job in jobs:

@@ -20,7 +20,6 @@ from modeler.batch.jobs import NOTES, read_note
 from modeler.export import RunFolder, mesh_of, poses_of, read_model, write_atomically
 from modeler.export.placing import model_upright
 from modeler.export.report import json_value
-from modeler.system.regular_files import read_regular
 from modeler.types import ACCEPTED, Array, InputError, ObjectModel
 
 if TYPE_CHECKING:
@@ -177,23 +176,6 @@ def fits(row: Mapping[str, Any]) -> bool:
     except (pa.ArrowException, TypeError, ValueError, OverflowError):
         return False
     return True
-
-
-def read_table(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a table.
-
-    Raises:
-        InputError: if there is none, or it has not these columns.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        table = pq.read_table(io.BytesIO(read_regular(path)))
-        return table.select(list(_COLUMNS)).cast(_schema()).to_pylist()
-    except (pa.ArrowException, KeyError) as error:
-        what = " ".join(str(error).split())
-        raise InputError(f"{path}: is not a list of models ({what}); run modeler batch again") from None
 
 
 def _schema() -> pa.Schema:

@@ -164,7 +164,10 @@ def _run(command: Command) -> int:
     _check_environment()
     check_room(_ROOM)
     with endable():
-        _import_numba()
+        # Without the settings that Numba looks for in the current folder, in a file of YAML.
+        with _instead_of("yaml", None), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            importlib.import_module("numba")
         from modeler.cli.pages import View
 
         importlib.import_module("modeler.viz.viewer" if isinstance(command, View) else "modeler.cli.reading")
@@ -179,13 +182,6 @@ def _run(command: Command) -> int:
     except InputError as error:
         complain(str(error).strip().removesuffix("."))
         return 2
-
-
-def _import_numba() -> None:
-    """Import Numba without the settings that it looks for in the current folder, in a file of YAML."""
-    with _instead_of("yaml", None), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        importlib.import_module("numba")
 
 
 @contextlib.contextmanager

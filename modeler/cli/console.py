@@ -16,7 +16,7 @@ from functools import cache, partial
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from modeler.cli.messages import MESSAGES, is_quiet
+from modeler.cli.messages import MESSAGES
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -43,8 +43,11 @@ def say(words: str, level: int = logging.INFO, show: Callable[[str], object] | N
     """
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(as_options(words).split()))
     if MESSAGES.note(line, level):
-        with lost_without_harm():
+        try:
             (show or partial(print, file=sys.stderr))(f"modeler: {line}")
+        except (OSError, ValueError):  # ValueError: stderr is closed. Results do not depend on messages, now and later
+            with contextlib.suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def as_options(words: str) -> str:
@@ -77,16 +80,6 @@ def trusted_status(verdict: Verdict) -> int:
     if verdict.reasons:
         say(f"not to be trusted: {verdict.reasons[0]}")
     return 0 if verdict.trustworthy else 3
-
-
-@contextlib.contextmanager
-def lost_without_harm() -> Iterator[None]:
-    """Discard messages that cannot be written, now and later: results do not depend on them."""
-    try:
-        yield
-    except (OSError, ValueError):  # ValueError: stderr is closed
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 @contextlib.contextmanager
@@ -215,7 +208,8 @@ def bar() -> Progress:
         TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )
-    return Progress(*columns, console=terminal, disable=is_quiet() or not terminal.is_terminal)
+    quiet = MESSAGES.least > logging.INFO
+    return Progress(*columns, console=terminal, disable=quiet or not terminal.is_terminal)
 
 
 def _rounded(seconds: float) -> str:

@@ -117,8 +117,3 @@ class ToLog(logging.Handler):
         """Keep a record."""
         if MESSAGES.file is not None:
             MESSAGES.note(f"{record.name}: {record.getMessage()}", record.levelno)
-
-
-def is_quiet() -> bool:
-    """Return whether only errors are printed."""
-    return MESSAGES.least > logging.INFO

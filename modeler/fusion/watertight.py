@@ -61,7 +61,8 @@ def closed_field(field: DistanceField, seen: ViewBlocks, tau_m: float) -> Distan
     pad = [(0, int(n)) for n in blocks * stride - grid.shape]
     known = np.pad((field.weights > 0.0).astype(np.float32), pad)
     values = np.pad(np.where(field.weights > 0.0, field.values_m, 0.0), pad)
-    shares, sums = (_block_means(array, blocks, stride) for array in (known, values))
+    x, y, z = (int(n) for n in blocks)
+    shares, sums = (array.reshape(x, stride, y, stride, z, stride).mean(axis=(1, 3, 5)) for array in (known, values))
     level = np.clip(sums / np.maximum(shares, 1e-6) / cell_m, -1.0, 1.0).astype(np.float32)
     sure = shares > 0.5
     outside = ~sure & (seen_empty | _outer_layers(blocks))
@@ -157,14 +158,6 @@ def _without_deep_voids(field: DistanceField, deep: BoolArray, stride: int) -> D
     deep = deep.repeat(stride, 0).repeat(stride, 1).repeat(stride, 2)[inside]
     weights = np.where(deep & (field.values_m > 0.0), np.float32(0.0), field.weights)
     return DistanceField(field.grid, field.values_m, weights)
-
-
-def _block_means(
-    array: npt.NDArray[np.floating], blocks: npt.NDArray[np.int64], stride: int
-) -> npt.NDArray[np.floating]:
-    """Return the means of blocks of `stride` along each axis."""
-    x, y, z = (int(n) for n in blocks)
-    return array.reshape(x, stride, y, stride, z, stride).mean(axis=(1, 3, 5))
 
 
 def _outer_layers(shape: npt.NDArray[np.int64], layers: int = 1) -> BoolArray:

@@ -268,7 +268,8 @@ class BuildStep:
     def _choose(self, name: str) -> None:
         if (scan := self.page.scan) is not None:
             turns = name == "turntable"
-            scan.choose_prior(name, self.step_deg.value if turns else None, self.sigma_deg.value if turns else None)
+            step_deg, sigma_deg = (self.step_deg.value, self.sigma_deg.value) if turns else (None, None)
+            scan.choose(prior=name, step_deg=step_deg, step_sigma_deg=sigma_deg)
             self.update(scan)
 
     def _rechoose(self) -> None:

@@ -151,7 +151,7 @@ class Scan:
         roi = max(0, int(x0)), max(0, int(y0)), min(camera.width, int(x1) + 1), min(camera.height, int(y1) + 1)
         if roi[2] - roi[0] < 2 or roi[3] - roi[1] < 2:
             raise InputError("the box lies outside the image; draw it around the object")
-        self._choose(roi=roi)
+        self.choose(roi=roi)
         self.look()
 
     def point_at(self, frame: int, x: float, y: float) -> None:
@@ -172,14 +172,14 @@ class Scan:
             segmenter = Segmenter(roi=roi)
             inside = segmenter.segment(image, segmenter.scene(frames)).mask
             if inside[row, column] and not (roi is not None and _at_edge(inside, roi)):
-                self._choose(roi=roi)
+                self.choose(roi=roi)
                 self.look()
                 return
         raise InputError("no object stands out there; draw a box around it, or paint it")
 
     def whole_image(self) -> None:
         """Forget the box."""
-        self._choose(roi=None)
+        self.choose(roi=None)
         self.look()
 
     def paint(self, frame: int, points: Sequence[tuple[float, float]], radius_px: float, *, add: bool) -> None:
@@ -204,7 +204,7 @@ class Scan:
             if self.painted.pop(frame, None) is not None:
                 self._painted_file(frame).unlink(missing_ok=True)
                 self.strokes[frame] = self.strokes.get(frame, 0) + 1
-                self._choose(masked=None)
+                self.choose(masked=None)
 
     # Runs
 
@@ -231,7 +231,7 @@ class Scan:
         run = self.runs()[-1] if resume else next_run(self.folder)
         words = ["build", str(self._source()), "--out", str(run), *self.options(), *(["--resume"] if resume else [])]
         if not resume:
-            self._choose(dropped=())
+            self.choose(dropped=())
         title, frames = "Building the model", len(self.sequence.indices)
         return [Job(tuple(words), self.folder / f"{run.name}.log", title, frames=frames), page_job(run)]
 
@@ -247,7 +247,7 @@ class Scan:
     def edit_jobs(self, dropped: Sequence[int]) -> list[Job]:
         """Return the re-optimisation of the latest run without frames; nothing where all are back: it is as it was."""
         run = self.runs()[-1]
-        self._choose(dropped=tuple(sorted(dropped)))
+        self.choose(dropped=tuple(sorted(dropped)))
         if not dropped:
             return []
         out = self._edited(run)
@@ -263,7 +263,7 @@ class Scan:
         out = self.folder / f"camera-{len(self.runs())}.json"
         words = ("calibrate-camera", str(self.runs()[-1]), "--out", str(out), "--overwrite")
         words += () if known is None else ("--known", known)
-        self._choose(camera=str(out))
+        self.choose(camera=str(out))
         return Job(words, out.with_suffix(".log"), "Estimating the focal length")
 
     def suggest_job(self) -> Job:
@@ -310,14 +310,6 @@ class Scan:
         entries = [path for path in self.shelf.glob("*") if not path.name.startswith(".")]
         return sorted(entries, key=lambda path: path.stat().st_mtime, reverse=True)
 
-    def keep(self) -> None:
-        """Write the choices down."""
-        self._choose()
-
-    def choose_prior(self, prior: str | None, step_deg: float | None, step_sigma_deg: float | None) -> None:
-        """Choose how the object moved."""
-        self._choose(prior=prior, step_deg=step_deg, step_sigma_deg=step_sigma_deg)
-
     @cached_property
     def usual_prior(self) -> str:
         """The prior where none is chosen."""
@@ -357,7 +349,7 @@ class Scan:
                 depth_scale_mm=finest_unit_mm(farthest_m),
                 files={} if robot is None else {robot.name: read_regular(robot)},
             )
-            self._choose(masked=out.name)
+            self.choose(masked=out.name)
             return out
 
     def _look(self, asked: int) -> None:
@@ -380,7 +372,7 @@ class Scan:
         write_atomically(self._painted_file(frame), encoded(mask.astype(np.uint8) * 255, "PNG"))
         self.painted[frame] = mask
         self.strokes[frame] = self.strokes.get(frame, 0) + 1
-        self._choose(masked=None)
+        self.choose(masked=None)
 
     def _painted_file(self, frame: int) -> Path:
         (self.folder / "painted").mkdir(parents=True, exist_ok=True)
@@ -393,8 +385,8 @@ class Scan:
                 found[int(path.stem)] = np.asarray(Image.open(io.BytesIO(read_regular(path)))) > 0
         return found
 
-    def _choose(self, **changes: Any) -> None:
-        """Change choices, and keep them: a server that is killed goes on from there."""
+    def choose(self, **changes: Any) -> None:
+        """Change choices by the names of their fields, and keep them: a server that is killed goes on from there."""
         with self._lock:
             self.choices = replace(self.choices, **changes)
             self.folder.mkdir(parents=True, exist_ok=True)

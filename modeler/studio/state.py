@@ -40,7 +40,7 @@ class Studio:
         folder, choices = self._chosen(sequence)
         if folder not in self._scans:
             scan = self._scans[folder] = Scan(folder, choices)
-            scan.keep()
+            scan.choose()
         self.show(self._scans[folder])
         return self._scans[folder]
 
