@@ -1,5 +1,6 @@
 """The baselines' algebra: where they start, what they match, and in which tangent they state their information."""
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,7 +20,6 @@ from modeler.baselines import (
     GicpRegistrar,
     IcpRegistrar,
     KissIcpRegistrar,
-    fpfh,
 )
 from modeler.baselines.clouds import (
     Cloud,
@@ -370,7 +370,7 @@ def test_sparse_clouds_are_registered_by_the_levels_that_they_allow(pair: Pair, 
     assert found.outcome is Outcome.TOO_FEW_POINTS
 
 
-@pytest.mark.skipif(not fpfh.kiss_installed(), reason="KISS-Matcher is not installed")
+@pytest.mark.skipif(importlib.util.find_spec("kiss_matcher") is None, reason="KISS-Matcher is not installed")
 def test_kiss_finds_any_motion_of_a_body_with_features(rng: np.random.Generator) -> None:
     """A bumpy ball of 4 cm, smaller than the cubes that KISS-Matcher is made for, turned by 140°; twice the same."""
     directions = rng.normal(size=(20_000, 3))

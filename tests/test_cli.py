@@ -15,7 +15,6 @@ import trimesh
 from command_runner import BOX, FILES, Run
 
 from modeler import priors, se3
-from modeler.baselines import fpfh
 from modeler.cli import main
 from modeler.composition import compose
 from modeler.composition.compose import comes_back
@@ -251,7 +250,7 @@ def test_coloured_icp_refuses_what_has_no_colour(
 def test_kiss_is_refused_where_it_is_not_installed(
     refusal: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...]
 ) -> None:
-    monkeypatch.setattr(fpfh, "kiss_installed", lambda: False)
+    monkeypatch.setitem(sys.modules, "kiss_matcher", None)
     named = ("--methods", "kiss", "--out", tmp_path / "out") if arguments[0] == "evaluate" else ("--method", "kiss")
     assert "-m pip install 'modeler[peers]'" in refusal(*arguments, *named)
 

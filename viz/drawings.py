@@ -23,12 +23,6 @@ VIEW_POINTS: Final = 6_000  # of a view, as drawn: a surface is seen, and what i
 ABOVE_LEFT: Final = np.array([-0.36, -0.48, -0.8])  # from the object to eye or light; the camera is at -z, up is -y
 
 
-def draw_axes() -> Drawing:
-    """Yield the axes of the 3D views: x right, y down, z forward."""
-    for path in (entities.PAIR, entities.WORLD, entities.TRACKED):
-        yield path, rr.ViewCoordinates.RDF
-
-
 def shown_posterior(step: Step) -> Posterior | None:
     """Return the first registration of the step's frame to a view that is at hand: the odometry pair."""
     own = (posterior for posterior in step.posteriors if posterior.source == step.frame.index)

@@ -61,14 +61,6 @@ def distance_m(step: Step) -> float:
     return float(np.linalg.norm(points_m[:: math.ceil(len(points_m) / 500)].mean(axis=0)))
 
 
-def below_ring_m(step: Step) -> Array:
-    """Return a point (3,) below the graph as seen by the initial eye, for a caption."""
-    first = step.views[min(step.views)]
-    towards_eye = OVER_THE_RING / np.linalg.norm(OVER_THE_RING)
-    down = np.array([0.0, 1.0, 0.0]) - towards_eye[1] * towards_eye
-    return first.centroid_m + upright(first) @ down * (distance_m(step) / np.linalg.norm(down))
-
-
 def _edges(step: Step) -> Drawing:
     """Yield the edges as lines between camera centres; an edge of a frame without a pose has no place."""
     trajectory = step.solution.trajectory
@@ -166,8 +158,14 @@ def _of_edges(step: Step, factor: float) -> Drawing:
 
 
 def _below_ring(step: Step, words: str) -> rr.AsComponents:
-    """Return a caption below the graph, nothing without words or where nothing is drawn."""
-    return caption(below_ring_m(step), words, entities.UNCERTAINTY_RGB) if words and step.views else CLEAR
+    """Return a caption below the graph as seen by the initial eye; nothing without words or where nothing is drawn."""
+    if not (words and step.views):
+        return CLEAR
+    first = step.views[min(step.views)]
+    towards_eye = OVER_THE_RING / np.linalg.norm(OVER_THE_RING)
+    down = np.array([0.0, 1.0, 0.0]) - towards_eye[1] * towards_eye
+    at_m = first.centroid_m + upright(first) @ down * (distance_m(step) / np.linalg.norm(down))
+    return caption(at_m, words, entities.UNCERTAINTY_RGB)
 
 
 def magnification(edges: Sequence[Edge], distance_m: float) -> float:

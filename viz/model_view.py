@@ -106,11 +106,6 @@ def _merged_points(step: Step, poses: Mapping[int, Array]) -> rr.Points3D:
     )
 
 
-def draw_tracked_model(model: ObjectModel) -> Drawing:
-    """Yield the model, in its own frame, for all times."""
-    yield entities.TRACKED_MESH, mesh(model)
-
-
 def draw_tracked(frame: Frame, found: Tracked, renderer: ModelRenderer) -> Drawing:
     """Yield a frame with the model's outline, and in 3D the model in its pose among the points of the object."""
     if found.pose is None:

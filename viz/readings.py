@@ -81,13 +81,9 @@ def draw_legend(name: str, facts: Mapping[str, object]) -> Drawing:
                 yield path, rr.SeriesLines(colors=rgb, names=series, widths=1.5)
                 yield path, rr.SeriesPoints(colors=rgb, names=series, markers="circle", marker_sizes=3.0)
     yield entities.LEGEND, rr.TextDocument(entities.LEGEND_TEXT, media_type=rr.MediaType.MARKDOWN)
-    yield entities.RUN, rr.TextDocument(run_words(name, facts), media_type=rr.MediaType.MARKDOWN)
-
-
-def run_words(name: str, facts: Mapping[str, object]) -> str:
-    """Return name and settings of the run in Markdown."""
     rows = [f"| {key.replace('_', ' ')} | {_fact(value)} |" for key, value in facts.items()]
-    return "\n".join([f"### {name}", "", "| | |", "|---|---|", *rows] if rows else [f"### {name}"])
+    words = "\n".join([f"### {name}", "", "| | |", "|---|---|", *rows] if rows else [f"### {name}"])
+    yield entities.RUN, rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN)
 
 
 def _fact(value: object) -> str:

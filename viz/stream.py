@@ -343,7 +343,7 @@ def open_stream(
     load()
     import rerun as rr
 
-    from modeler.viz import drawings, images, readings
+    from modeler.viz import images, readings
 
     listens = connect is not None and viewer.reachable(connect)
     file = None if save is None else RecordingFile(Path(save))
@@ -370,7 +370,8 @@ def open_stream(
         stream.send(lambda recording: recording.send_recording_name(name))
         stream.lay_out(_layout(None, advised=advised))
         legend = readings.draw_legend(name, facts or {})
-        stream.draw(None, itertools.chain(drawings.draw_axes(), images.draw_area_colours(), legend))
+        axes = ((path, rr.ViewCoordinates.RDF) for path in (entities.PAIR, entities.WORLD, entities.TRACKED))
+        stream.draw(None, itertools.chain(axes, images.draw_area_colours(), legend))
     return stream
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,8 +25,8 @@ from modeler.baselines.clouds import (
 )
 from modeler.baselines.icp import FINE, IcpRegistrar
 from modeler.registration.features import FeatureMatcher, fpfh, kabsch, mutual_matches
-from modeler.system.processes import install_command
-from modeler.types import Array, InputError, RayImage
+from modeler.system.processes import check_installed
+from modeler.types import Array, RayImage
 
 _VOXEL = 1 / 40  # edge, as a fraction of the object's size
 _BATCH = 2_000  # draws between evaluations of the stopping rule: 50 at most
@@ -145,12 +144,9 @@ class FpfhIcpRegistrar(AbstractCloudRegistrar):
         return None if coarse is None else REFINEMENT.refine(*clouds, coarse.target_from_source)
 
 
-KISS_MISSING = f"KISS-Matcher is not installed; install it with: {install_command('peers')}"
-
-
-def kiss_installed() -> bool:
-    """Return whether KISS-Matcher can be imported."""
-    return importlib.util.find_spec("kiss_matcher") is not None
+def check_kiss() -> None:
+    """Reject the use of KISS-Matcher where it is not installed."""
+    check_installed("kiss_matcher", "KISS-Matcher", "peers")
 
 
 @dataclass(frozen=True)
@@ -168,8 +164,7 @@ class KissIcpRegistrar(AbstractCloudRegistrar):
         Raises:
             InputError: if KISS-Matcher is not installed.
         """
-        if not kiss_installed():
-            raise InputError(KISS_MISSING)
+        check_kiss()
         clouds = Cloud.of(source), Cloud.of(target)
         if min(len(cloud.points_m) for cloud in clouds) < self.min_points:
             return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
 import logging
 import os
 import shutil
@@ -19,7 +18,7 @@ from threading import Lock
 from typing import Any, TypeVar
 
 from modeler.batch.jobs import PROCESSES, TRIES, Ended, Job, read_note, run, write_failure
-from modeler.system.processes import cores, environment, install_command
+from modeler.system.processes import check_installed, cores, environment
 from modeler.types import InputError
 
 T = TypeVar("T")
@@ -54,8 +53,8 @@ def check_engine(name: str) -> None:
             f"`executor` {name} is unknown; give processes, dask:ADDRESS, slurm:FOLDER, or module:callable for your own"
         )
     package = {"dask": "distributed", "slurm": "submitit"}.get(kind)
-    if package is not None and importlib.util.find_spec(package) is None:
-        raise InputError(f"`executor` {name}: {package} is not installed; {install_command(kind)}")
+    if package is not None:
+        check_installed(package, package, kind)
 
 
 def is_here(name: str) -> bool:

@@ -213,8 +213,7 @@ def _offsets(text: str) -> tuple[int, ...]:
 
 def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
     """Evaluate the models of runs, write `models.json` and `models.csv`, print a table and return the exit status."""
-    from modeler.experiment import models_csv, models_json
-    from modeler.export import write_atomically
+    from modeler.experiment import write_models
     from modeler.types import InputError
 
     scores, left_out = [], []
@@ -227,12 +226,7 @@ def _evaluate_models(runs: Sequence[Path], out: Path, seed: int) -> int:
             left_out.append(f"{path} is left out: {str(error).removesuffix('.')}")
     if not scores:
         raise InputError(left_out[0])
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from error
-    write_atomically(out / "models.json", models_json(scores, seed))
-    write_atomically(out / "models.csv", models_csv(scores))
+    write_models(scores, out, seed)
     print(columns(_models_table(scores), left=3))
     for line in left_out:
         say(line)
@@ -285,23 +279,12 @@ def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
 def _models_table(scores: Sequence[ModelScore]) -> list[tuple[str, ...]]:
     """Return heading and rows of a table of scores."""
     heading = ("model", "poses", "over", "frames", "max deg", "accuracy mm", "completeness mm", "F 3 mm", "F 5 mm")
-    return [
-        heading,
-        *(
-            (
-                score.run,
-                score.poses,
-                score.over,
-                str(score.frames),
-                f"{score.rotation_error_deg:.2f}",
-                f"{score.accuracy_mm:.2f}",
-                f"{score.completeness_mm:.2f}",
-                f"{score.f_3mm:.3f}",
-                f"{score.f_5mm:.3f}",
-            )
-            for score in scores
-        ),
-    ]
+    lines = [heading]
+    for score in scores:
+        lengths = (f"{value:.2f}" for value in (score.rotation_error_deg, score.accuracy_mm, score.completeness_mm))
+        shares = f"{score.f_3mm:.3f}", f"{score.f_5mm:.3f}"
+        lines.append((score.run, score.poses, score.over, str(score.frames), *lengths, *shares))
+    return lines
 
 
 @dataclass(frozen=True)

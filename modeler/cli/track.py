@@ -111,7 +111,7 @@ class Track:
         """Track the object through frames, write and show it."""
         from modeler.cli.reading import reading, while_it_lasts
         from modeler.runs.known_objects import PAGE
-        from modeler.viz import blueprint, model_view
+        from modeler.viz import blueprint, entities, model_view
         from modeler.viz.report.track import write_track_page
         from modeler.viz.stream import open_stream
 
@@ -121,7 +121,7 @@ class Track:
         found: list[Tracked] = []
         try:
             stream.lay_out(blueprint.tracking_layout(None))
-            stream.draw_at(None, model_view.draw_tracked_model(tracker.model))
+            stream.draw_at(None, [(entities.TRACKED_MESH, model_view.mesh(tracker.model))])
             with Interrupt() as interrupt, reading() as watched:
                 shown = watched(frames, "tracking").until(lambda: interrupt.asked)
                 for frame in interrupt.until(while_it_lasts(shown) if frames.live else shown):

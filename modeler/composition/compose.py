@@ -141,8 +141,7 @@ def registrar(
         case "fpfh-icp":
             return baselines.FpfhIcpRegistrar()
         case "kiss":
-            if not fpfh.kiss_installed():
-                raise InputError(f"`method` kiss: {fpfh.KISS_MISSING}")
+            fpfh.check_kiss()
             return baselines.KissIcpRegistrar()
 
 

@@ -10,5 +10,4 @@ from modeler.experiment.results import Modelled as Modelled
 from modeler.experiment.results import ModelScore as ModelScore
 from modeler.experiment.results import evaluate as evaluate
 from modeler.experiment.results import model_scores as model_scores
-from modeler.experiment.results import models_csv as models_csv
-from modeler.experiment.results import models_json as models_json
+from modeler.experiment.results import write_models as write_models

@@ -151,14 +151,20 @@ def _score(modelled: Modelled, candidate: _Candidate, over: Over, errors: Surfac
     )
 
 
-def models_json(scores: Sequence[ModelScore], seed: int) -> str:
-    """Return scores as JSON."""
-    return json.dumps({"schema": 1, "seed": seed, "models": [asdict(score) for score in scores]}, indent=1) + "\n"
+def write_models(scores: Sequence[ModelScore], out: Path, seed: int) -> None:
+    """Write `models.json` and `models.csv`, a field a column, into a folder, made where there is none."""
+    records = [asdict(score) for score in scores]
+    _make(out)
+    write_atomically(out / "models.json", json.dumps({"schema": 1, "seed": seed, "models": records}, indent=1) + "\n")
+    write_atomically(out / "models.csv", _csv([f.name for f in fields(ModelScore)], records))
 
 
-def models_csv(scores: Sequence[ModelScore]) -> str:
-    """Return scores as CSV, a field a column."""
-    return _csv([f.name for f in fields(ModelScore)], map(asdict, scores))
+def _make(out: Path) -> None:
+    """Make a folder for results."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with `out`") from error
 
 
 def evaluate(
@@ -186,10 +192,7 @@ def evaluate(
         if names.count(recorded.name) > 1:
             raise InputError(f"two sequences are called {recorded.name!r}; give each a name in its sequence.json.")
         experiment.size(recorded)  # refuses what cannot be judged, before hours are spent on the others
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another folder with `out`") from error
+    _make(out)
     trials: list[Trial] = []
     for recorded in sequences:
         for trial in experiment.trials(recorded):

@@ -231,22 +231,17 @@ def _texts(tree: Any) -> Iterator[str]:
         yield from _texts(part)
 
 
-def _numbers(count: int) -> Test:
-    return lambda value: isinstance(value, list) and len(value) == count and all(map(_is_number_or_null, value))
+def _list_of(test: Test, count: int | None = None) -> Test:
+    """Return the test of a list of values that pass a test, of any number of them or of `count`."""
+    return lambda value: isinstance(value, list) and count in (None, len(value)) and all(map(test, value))
+
+
+def _record_of(tests: Mapping[str, Test], may_lack: frozenset[str] = frozenset()) -> Test:
+    return lambda value: _wrong(value, tests, may_lack) is None
 
 
 def _is_direction(value: Any) -> bool:
-    return _numbers(3)(value) and None not in value and abs(math.hypot(*value) - 1.0) < _ROUND
-
-
-def _are_modes(value: Any) -> bool:
-    return isinstance(value, list) and all(_wrong(mode, _MODE) is None for mode in value)
-
-
-def _is_loop(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        _is_number(value.get(name)) for name in ("opening_deg", "opening_m", "sigmas")
-    )
+    return _list_of(_is_number, 3)(value) and abs(math.hypot(*value) - 1.0) < _ROUND
 
 
 def _is_camera(value: Any) -> bool:
@@ -257,14 +252,7 @@ def _is_camera(value: Any) -> bool:
     return all(_is_number(factor) and 0.25 <= factor <= 4.0 for factor in factors) and all(map(_is_number, sigmas))
 
 
-def _is_figure(value: Any) -> bool:
-    return (
-        isinstance(value, dict)
-        and all(_is_number_or_null(value.get(name)) for name in ("value", "limit"))
-        and isinstance(value.get("holds"), bool)
-    )
-
-
+_FIGURE: dict[str, Test] = {"value": _is_number_or_null, "limit": _is_number_or_null, "holds": _is(bool)}
 _WHOLE: dict[str, Test] = {
     "sequence": _is_text,
     "settings": _is(dict),
@@ -272,15 +260,15 @@ _WHOLE: dict[str, Test] = {
     "edges": _is(list),
     "poses": _is(list),
     "closed": _is(bool),
-    "loop": _null_or(_is_loop),
+    "loop": _null_or(_record_of(dict.fromkeys(("opening_deg", "opening_m", "sigmas"), _is_number))),
     "camera": _null_or(_is_camera),
     "trustworthy": _is(bool),
     "tolerance_m": _null_or(_is_number),
     "trusted_to_m": _null_or(_is_number),
-    "reasons": lambda value: isinstance(value, list) and all(map(_is_text, value)),
-    "reason_codes": _null_or(lambda value: isinstance(value, list) and all(map(_is(str), value))),
-    "evidence": _null_or(lambda value: isinstance(value, dict) and all(map(_is_figure, value.values()))),
-    "scene_frames": _null_or(lambda value: isinstance(value, list) and all(map(_is_whole, value))),
+    "reasons": _list_of(_is_text),
+    "reason_codes": _null_or(_list_of(_is(str))),
+    "evidence": _null_or(lambda value: isinstance(value, dict) and all(map(_record_of(_FIGURE), value.values()))),
+    "scene_frames": _null_or(_list_of(_is_whole)),
     "seconds": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
     "up": _null_or(_is_direction),
     "support_offset_m": _null_or(_is_number),  # which reports of earlier versions have not, nor `up`
@@ -294,10 +282,10 @@ _FRAME: dict[str, Test] = {
     "mask": _null_or(_is_text),
 }
 _MOTION: dict[str, Test] = {
-    "target_from_source": _numbers(16),
-    "covariance": _numbers(36),
-    "covariance_given_camera": _null_or(_numbers(36)),
-    "by_focal": _null_or(_numbers(6)),
+    "target_from_source": _list_of(_is_number_or_null, 16),
+    "covariance": _list_of(_is_number_or_null, 36),
+    "covariance_given_camera": _null_or(_list_of(_is_number_or_null, 36)),
+    "by_focal": _null_or(_list_of(_is_number_or_null, 6)),
 }
 _MODE: dict[str, Test] = {"weight": _is_number_or_null, **_MOTION}
 _POSE: dict[str, Test] = {
@@ -313,7 +301,7 @@ _EDGE: dict[str, Test] = {
     "reason": _is_text,
     "outcome": lambda value: value in [outcome.label for outcome in Outcome],
     **_MOTION,
-    "modes": _null_or(_are_modes),
+    "modes": _null_or(_list_of(_record_of(_MODE, _LATER))),
     "overlap": _is_number_or_null,
     "colour_correlation": _is_number_or_null,
     "independent_colours": _is_number_or_null,
@@ -323,13 +311,13 @@ _EDGE: dict[str, Test] = {
     "seconds": _is_number_or_null,
 }
 _SETTINGS: dict[str, Test] = {
-    "joined": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_is_text, value)),
+    "joined": _list_of(_is_text, 2),
     "continues": _is_text,
     "same_camera": _is(bool),
     "offset": _is_whole,
     "later_s": _is_number,
     "sensor": _is_text,
-    "roi": _null_or(lambda value: isinstance(value, list) and len(value) == 4 and all(map(_is_whole, value))),
+    "roi": _null_or(_list_of(_is_whole, 4)),
     "max_depth_m": _null_or(_is_number),
     "voxel_m": _null_or(_is_number),
     "tolerance_mm": _null_or(_is_number),

@@ -19,7 +19,7 @@ from modeler.graph import PoseGraph
 from modeler.pipeline.joining import Alignment, Joiner, Segment
 from modeler.pipeline.pairs import Registrations
 from modeler.registration import VisibilityRegistrar
-from modeler.runs.reopening import Part, Reopened, renumbered, reopened, solved
+from modeler.runs.reopening import Reopened, renumbered, reopened, solved
 from modeler.types import Edge, FrameRecord, InputError, Outcome, RayImage, Segmentation, Solution, Step, Verdict
 from modeler.verdict import judged
 from modeler.verdict.spreads import widened
@@ -64,6 +64,8 @@ def join(
     guess = dict(first.solution.trajectory) | {
         frame: alignments[0].target_from_source @ pose for frame, pose in second.solution.trajectory.items()
     }
+    parts = (*first.parts, *second.parts)
+    cameras = [camera for part in parts if (camera := part.report.get("camera")) is not None]
     made = RunFolder(out)
     meta = RunMeta(
         sequence=" + ".join([*sequences_of(run_a, first, out), *sequences_of(run_b, second, out)]),
@@ -76,7 +78,8 @@ def join(
             "pairs": pairs,
             **stated_tolerance(first, second),
         },
-        camera=_least_known([*first.parts, *second.parts]),
+        # The one whose depth scale is the most uncertain; none if all are as given.
+        camera=max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None),
     )
     shown = [edge for edge in graph.edges if edge.source in second.views and edge.target in first.views]
     views = {**first.views, **second.views}
@@ -95,12 +98,6 @@ def stated_tolerance(*runs: Reopened) -> dict[str, float]:
     stated = [run.report["settings"].get("tolerance_mm") for run in runs]
     known = [tolerance_mm for tolerance_mm in stated if tolerance_mm is not None]
     return {"tolerance_mm": min(known)} if known else {}
-
-
-def _least_known(parts: Sequence[Part]) -> dict[str, float | str] | None:
-    """Return the estimate of the camera with the most uncertain depth scale; None if all are as given."""
-    cameras = [camera for part in parts if (camera := part.report.get("camera")) is not None]
-    return max(cameras, key=lambda camera: float(camera["depth_scale_sigma"]), default=None)
 
 
 def later_s(first: Reopened, second: Reopened) -> float:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 from nicegui import events, run, ui
 
-from modeler.studio.capture import Capture
 from modeler.studio.capture_steps import TONE, CaptureStep, FilesStep, ScansStep
 from modeler.studio.jobs import POLL_S, Job
 from modeler.studio.model_steps import BuildStep, CheckStep, ExportStep
@@ -150,7 +149,11 @@ class Page:
         if job is not None and job.failure is not None:
             complain(f"{job.title}: {job.failure}")
         if capture is not None and not capture.job.running and self.studio.queue.current is None:
-            self._captured(capture)
+            self.studio.release()
+            try:
+                self.studio.open(capture.folder)  # of which the model has been made
+            except InputError as error:
+                complain(error)
         elif scan is not None and job is not None:
             self.building.update(scan)
             self.check.draw(scan)
@@ -159,14 +162,6 @@ class Page:
                 self.building.embed()
                 if job.words[0] == "report" and job.failure is None:
                     self.go("Check")
-
-    def _captured(self, capture: Capture) -> None:
-        """Go on with a capture of which the model has been made."""
-        self.studio.release()
-        try:
-            self.studio.open(capture.folder)
-        except InputError as error:
-            complain(error)
 
     async def _key(self, event: events.KeyEventArguments) -> None:
         """Turn frames with the arrow keys, choose steps with the digits, build with B, take views with T."""

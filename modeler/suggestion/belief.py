@@ -365,7 +365,9 @@ class Belief:
         count = int(self.predictor.likelihood.points * share)
         some = seen[np.linspace(0, len(seen) - 1, max(min(count, len(seen)), 1)).astype(np.intp)]
         variances_m2 = np.full(len(some), self._variance_m2)
-        ahead, frame = self._frames_ahead(candidate), self.last.frame
+        frame, table = self.last.frame, turntable_in(self.prior)
+        # A turntable's prior counts steps.
+        ahead = 1 if table is None else max(round(abs(candidate.turn_deg / table.step_deg)), 1)
         frame = Frame(frame.index + ahead, frame.time_s + ahead, frame.depth_m, frame.camera)
         image = replace(self.last, frame=frame, points_m=points_m[seen], normals=normals[seen], layers={})
         unseen = ~self.cells.seen[visible]
@@ -379,11 +381,6 @@ class Belief:
             normal_variance=self.cells.normal_variance,
             axis_m=se3.transform(camera_from_object, self.stand.object_from_stand[None, :3, 3])[0],
         )
-
-    def _frames_ahead(self, candidate: Candidate) -> int:
-        """Return the number of frames until the new one: of a turntable, whose prior counts steps, those of a turn."""
-        table = turntable_in(self.prior)
-        return 1 if table is None else max(round(abs(candidate.turn_deg / table.step_deg)), 1)
 
     def _edges(
         self, predicted: PredictedView, object_from_new: Array, candidate: Candidate

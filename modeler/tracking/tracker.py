@@ -429,7 +429,9 @@ class Tracker:
             open_rad, _ = self._sigmas(modes[0].pose, self.symmetries)
             if outcome == "found" and np.degrees(open_rad) > self.registrar.max_sigma_deg:
                 outcome = "unsure"
-        modes = [Mode(mode.weight, self._of_camera(mode.pose, view, free)) for mode in modes]
+        for number, (weight, pose) in enumerate((mode.weight, mode.pose) for mode in modes):
+            common = of_the_camera(pose.mean, self.renderer.centre_m, view.sigma_focal, self.depth_scale_sigma)
+            modes[number] = Mode(weight, replace(pose, covariance=pose.covariance + common + free))
         return Tracked(
             view.index,
             view.frame.time_s,
@@ -447,11 +449,6 @@ class Tracker:
         if self.renderer.sigma_m == 0.0:
             return pose
         return replace(pose, covariance=pose.covariance + of_the_model(view, pose, self.renderer))
-
-    def _of_camera(self, pose: PoseGaussian, view: RayImage, free: Array) -> PoseGaussian:
-        """Return a pose with the errors of the camera, and a covariance (6, 6) of what nothing shows."""
-        common = of_the_camera(pose.mean, self.renderer.centre_m, view.sigma_focal, self.depth_scale_sigma)
-        return replace(pose, covariance=pose.covariance + common + free)
 
     def _doubt(self, modes: list[Mode], symmetries: Symmetries | None = None) -> str:
         """Return why modes are not of use, but for symmetries; an empty text if they are."""

@@ -164,11 +164,6 @@ class ObjectModel:
     interpolated. None: unknown."""
 
 
-def no_model() -> ObjectModel | None:
-    """Return the model of a step that has none."""
-    return None
-
-
 @dataclass(frozen=True, eq=False)
 class Step:
     """The result of one frame, and the state of the run after it.
@@ -188,7 +183,7 @@ class Step:
     """Why the frame is not part of the model; None: it is."""
     solution: Solution
     """All poses so far."""
-    make_model: Callable[[], ObjectModel | None] = no_model
+    make_model: Callable[[], ObjectModel | None] = lambda: None
     edges_so_far: tuple[Edge, ...] = ()
     """Every edge so far, accepted or not, in order."""
     views: Mapping[int, RayImage] = field(default_factory=dict)

@@ -72,19 +72,6 @@ def displacement(views: Mapping[int, RayImage], solution: Solution) -> Check | N
     return Check(max(moved_m), SIGMAS * first.sigma_r_m, at_least=True)
 
 
-@dataclass(frozen=True)
-class Contradiction:
-    """The edge whose posterior is farthest from its prior."""
-
-    source: int
-    """Frame number of the source view."""
-    target: int
-    """Frame number of the target view."""
-    check: Check
-    """Standard deviations of a Gaussian prior in six dimensions: √(2 Δ), with Δ in nats from the prior's mode to the
-    posterior's mean. Defined alike for other densities."""
-
-
 def prior_distances(
     edges: Sequence[Edge],
     views: Mapping[int, RayImage],
@@ -143,8 +130,11 @@ def distance_nats(density: AbstractPoseDensity, here: float) -> float:
     return min(height, 0.5 * float(chdtri(6, rarer))) if rarer > 0.0 else height
 
 
-def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | None:
-    """Return the edge whose posterior contradicts the prior most; None if nothing can be compared.
+def contradiction(distances: Sequence[tuple[Edge, float]]) -> tuple[Edge, Check] | None:
+    """Return the edge whose posterior contradicts the prior most, and by how much; None if nothing can be compared.
+
+    In standard deviations of a Gaussian prior in six dimensions: √(2 Δ), with Δ in nats from the prior's mode to the
+    posterior's mean. Defined alike for other densities.
 
     Args:
         distances: as `prior_distances` returns them.
@@ -152,7 +142,7 @@ def contradiction(distances: Sequence[tuple[Edge, float]]) -> Contradiction | No
     if not distances:
         return None
     edge, nats = max(distances, key=lambda found: found[1])
-    return Contradiction(edge.source, edge.target, Check(float(np.sqrt(2.0 * nats)), radius(RARE)))
+    return edge, Check(float(np.sqrt(2.0 * nats)), radius(RARE))
 
 
 def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
@@ -422,26 +412,13 @@ def looked_up(view: RayImage, near_m: Array, points_m: Array, normals: Array, to
         normals: (n, 3) unit.
         tolerance_m: distance up to which a point is on the surface.
     """
-    beyond_m = _beyond(view, near_m, points_m, normals)
-    return np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])
-
-
-def _beyond(view: RayImage, near_m: Array, points_m: Array, normals: Array) -> Array:
-    """Return the distances (n,) in m that a view measured beyond points; NaN for those that do not face its camera.
-
-    Args:
-        view: the view.
-        near_m: (h, w) least depth around each of its pixels.
-        points_m: (n, 3) in its camera's coordinates.
-        normals: (n, 3) unit.
-    """
     depth_m = points_m[:, 2]
     ahead = np.flatnonzero(faces_camera(points_m, normals) & (depth_m > 0.0))
     rows, columns = pixels_of(view, points_m[ahead]).T
     height, width = near_m.shape
     inside = (columns >= _MARGIN_PX) & (columns < width - _MARGIN_PX)
     inside &= (rows >= _MARGIN_PX) & (rows < height - _MARGIN_PX)
-    beyond_m = np.full(len(points_m), np.nan)
+    beyond_m = np.full(len(points_m), np.nan)  # that the view measured; NaN of points that do not face its camera
     judged = ahead[inside]
     beyond_m[judged] = near_m[rows[inside].astype(int), columns[inside].astype(int)] - depth_m[judged]
-    return beyond_m
+    return np.stack([beyond_m > tolerance_m, np.abs(beyond_m) <= tolerance_m])

@@ -162,11 +162,12 @@ def _found(
     places = {frame: place for place, frame in enumerate(sorted(frame.id for frame in frames))}
     distances = [] if prior is None else prior_distances(edges, views, prior, places, solution)
     if (against := contradiction(distances)) is not None:
+        edge, check = against
         words = (
-            f"the images contradict the prior: from frame {against.target} to {against.source} the object moved "
-            f"{against.check.value:.0f} standard deviations from the prior"
+            f"the images contradict the prior: from frame {edge.target} to {edge.source} the object moved "
+            f"{check.value:.0f} standard deviations from the prior"
         )
-        found.append(_Finding("prior_sds", against.check, "prior_contradicted", words))
+        found.append(_Finding("prior_sds", check, "prior_contradicted", words))
     if (together := prior_check(distances)) is not None:
         words = (
             f"the images contradict the prior in all pairs together: squared distances from it are "

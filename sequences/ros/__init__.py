@@ -27,12 +27,9 @@ from modeler.types import Camera, InputError
 
 def first_images(bag: Bag) -> dict[str, Any]:
     """Return the first message of each topic of images."""
-    kinds = (messages.IMAGE, messages.PACKED)
-    found = {}
-    for topic in sorted(topic for topic, kind in bag.types.items() if kind in kinds):
-        for _, message in bag.messages(topic, most=1):
-            found[topic] = message
-    return found
+    topics = sorted(topic for topic, kind in bag.types.items() if kind in (messages.IMAGE, messages.PACKED))
+    found = {topic: bag.first(topic) for topic in topics}
+    return {topic: message for topic, message in found.items() if message is not None}
 
 
 def choose_depth_topic(bag: Bag, first: Mapping[str, Any], overrides: Overrides) -> str:
@@ -77,7 +74,7 @@ def _camera(bag: Bag, topic: str) -> Lens | None:
     parent = bare.rsplit("/", 1)[0]
     wanted = (f"{parent}/camera_info", f"{parent.rsplit('/', 1)[0]}/info/camera_info", f"{bare}/camera_info")
     for info in (name for name in wanted if name in infos):
-        for _, message in bag.messages(info, most=1):
+        if (message := bag.first(info)) is not None:
             known = messages.lens(message, f"{bag.path}: {info}", ros1=bag.is_ros1)
             return Lens(known.camera, ()) if "rect" in bare.rsplit("/", 1)[1] else known
     return realsense_lens(bag, topic)

@@ -243,6 +243,10 @@ class Bag:
                 stamp = replace(stamp, ordinal=stamp.ordinal + 1) if alike else Stamp(received_ns)
                 yield stamp, self._message(connection, data)
 
+    def first(self, topic: str) -> Any | None:
+        """Return the first message of a topic; None if it has none."""
+        return next((message for _, message in self.messages(topic)), None)
+
     def message(self, topic: str, stamp: Stamp) -> Any:
         """Return one message."""
         with input_errors(self.path, "bag", self._advice):

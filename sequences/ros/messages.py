@@ -237,10 +237,9 @@ def realsense_unit_mm(bag: Bag, topic: str) -> tuple[float, str] | None:
         return None
     for name in bag.types:
         if name.replace(" ", "_") == f"{sensor[1]}/option/Depth_Units/value":
-            for _, message in bag.messages(name, most=1):
-                found = _number(str(message.data)) * 1000.0
-                if 1e-6 <= found <= 1e3:
-                    return found, name
+            found = _number(str(getattr(bag.first(name), "data", ""))) * 1000.0
+            if 1e-6 <= found <= 1e3:
+                return found, name
     return None
 
 
@@ -248,19 +247,16 @@ def realsense_lens(bag: Bag, topic: str) -> Lens | None:
     """Return the camera of a topic from a text message, as version 2.58 writes it; None without."""
     stream = re.match(_STREAM, topic)
     name = None if stream is None else f"{stream[0]}/camera_info"
-    if name is None or bag.types.get(name) != TEXT:
+    if name is None or bag.types.get(name) != TEXT or (message := bag.first(name)) is None:
         return None
-    for _, message in bag.messages(name, most=1):
-        entries = _entries(message)
-        names = ("width", "height", "fx", "fy", "ppx", "ppy")
-        width, height, *pixels = (_number(entries.get(key, "")) for key in names)
-        distortion = _numbers(entries.get("coeffs", ""), 5)
-        sound = sane((pixels[0], pixels[1], pixels[2], pixels[3])) and bool(np.isfinite(distortion).all())
-        if not sound or not (1.0 <= width <= 1e5 and 1.0 <= height <= 1e5):
-            raise InputError(f"{bag.path}: {name}: describes no camera; record it again, or convert with `intrinsics`.")
-        camera = Camera(int(width), int(height), pixels[0], pixels[1], pixels[2], pixels[3])
-        return lens_of_model(camera, distortion.tolist(), entries.get("model", ""), f"{bag.path}: {name}")
-    return None
+    entries = _entries(message)
+    width, height, *pixels = (_number(entries.get(key, "")) for key in ("width", "height", "fx", "fy", "ppx", "ppy"))
+    distortion = _numbers(entries.get("coeffs", ""), 5)
+    sound = sane((pixels[0], pixels[1], pixels[2], pixels[3])) and bool(np.isfinite(distortion).all())
+    if not sound or not (1.0 <= width <= 1e5 and 1.0 <= height <= 1e5):
+        raise InputError(f"{bag.path}: {name}: describes no camera; record it again, or convert with `intrinsics`.")
+    camera = Camera(int(width), int(height), pixels[0], pixels[1], pixels[2], pixels[3])
+    return lens_of_model(camera, distortion.tolist(), entries.get("model", ""), f"{bag.path}: {name}")
 
 
 def realsense_colour_from_depth(bag: Bag, colour_topic: str, depth_topic: str) -> Array | None:
@@ -276,9 +272,8 @@ def _from_reference(bag: Bag, topic: str) -> Array | None:
     if stream is None:
         return None
     for name in bag.types:
-        if re.fullmatch(re.escape(stream[0]) + r"/tf/\w+", name):
-            for _, message in bag.messages(name, most=1):
-                return _pose(message, f"{bag.path}: {name}")
+        if re.fullmatch(re.escape(stream[0]) + r"/tf/\w+", name) and (message := bag.first(name)) is not None:
+            return _pose(message, f"{bag.path}: {name}")
     return None
 
 

@@ -12,6 +12,7 @@ otherwise the evidence is at fault. The status is 1 if no pair is right: then th
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +22,7 @@ from typing import Final, final, get_args
 
 import numpy as np
 
-from modeler.baselines import FpfhIcpRegistrar, KissIcpRegistrar, fpfh
+from modeler.baselines import FpfhIcpRegistrar, KissIcpRegistrar
 from modeler.evaluation import rotation_error_deg
 from modeler.pipeline import Modeler
 from modeler.priors import AutoPrior
@@ -82,7 +83,7 @@ def _trials(pair: Pair, limits: Iterable[Limits], seed: tuple[int, int], *, colo
     if "default" in limits:
         methods["visibility, default"] = partial(without_limits.register, pair.source, pair.target)
     methods["fpfh-icp"] = partial(by, FpfhIcpRegistrar(), "none")
-    if fpfh.kiss_installed():
+    if importlib.util.find_spec("kiss_matcher") is not None:
         methods["kiss"] = partial(by, KissIcpRegistrar(), "none")
     for method, register in methods.items():
         began_s = time.process_time()

@@ -20,7 +20,6 @@ from modeler.priors import GeneralPrior, TablePrior
 from modeler.registration import VisibilityRegistrar
 from modeler.segmentation import Segmenter, scene_frames
 from modeler.types import Array, Edge, PoseGaussian, Solution, Step
-from modeler.types.model import no_model
 from modeler.views import Sensor
 from studies.loops.cases import Case
 from studies.loops.known import Known
@@ -100,7 +99,7 @@ def run(maker: Modeler, case: Case, report: Callable[[Step, float, float], None]
         report(step, now - before, memory_mib())
         before = now
     assert step is not None
-    return _figures(case, replace(step, make_model=no_model), registrations, time.process_time() - began, peak_mib)
+    return _figures(case, replace(step, make_model=lambda: None), registrations, time.process_time() - began, peak_mib)
 
 
 def _figures(case: Case, step: Step, registrations: int, seconds: float, peak_mib: float) -> Result:
