@@ -1,4 +1,7 @@
-"""Advice on a run: what to change, in terms of parameters, which messages name in backticks."""
+"""Advice on a run: what to change, in terms of parameters, which messages name in backticks.
+
+A `report` is that of a run, as in report.json; `edges`, `frames` and `camera` are its entries; `prior` is the run's.
+"""
 
 from __future__ import annotations
 
@@ -48,10 +51,7 @@ def outcome_advice(outcome: Outcome, prior: AbstractPrior | None = None, posteri
 def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors: Sequence[Posterior] = ()) -> str:
     """Return what to do about a frame that was left out, in terms of parameters; "" if there is nothing to do.
 
-    Args:
-        reason: why it was left out.
-        prior: of the run.
-        posteriors: registrations of the frame.
+    It was left out for the reason; the posteriors are its registrations.
     """
     if not isinstance(reason, Failed):
         return advice(reason)
@@ -60,24 +60,14 @@ def reason_advice(reason: Reason, prior: AbstractPrior | None = None, posteriors
 
 
 def sign_is_ambiguous(report: Mapping[str, Any], prior: AbstractPrior) -> bool:
-    """Return whether views overlap so little that a table may turn in the other direction than its prior assumes.
-
-    Args:
-        report: of the run.
-        prior: of the run.
-    """
+    """Return whether views overlap so little that a table may turn in the other direction than its prior assumes."""
     little = any(frame.get("cause") == Outcome.NO_OVERLAP.label for frame in report["frames"])
     table = turntable_in(prior)
     return little and table is not None and table.step_sign == "known"
 
 
 def measured_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> str:
-    """Return in words the measured step if it contradicts the prior's, else "".
-
-    Args:
-        edges: of the report.
-        prior: of the run.
-    """
+    """Return in words the measured step if it contradicts the prior's, else ""."""
     table, turns, sigma_deg = turntable_in(prior), *_sure_turns_deg(edges)
     if table is None or len(turns) < QUORUM:
         return ""
@@ -94,11 +84,7 @@ def measured_step(edges: Sequence[Mapping[str, Any]], prior: AbstractPrior) -> s
 
 
 def step_angles_deg(edges: Sequence[Mapping[str, Any]]) -> list[float]:
-    """Return the rotations in degrees from one frame number to the next, of the least gap that occurs.
-
-    Args:
-        edges: of the report.
-    """
+    """Return the rotations in degrees from one frame number to the next, of the least gap that occurs."""
     odometry = [edge for edge in edges if edge["accepted"] and edge["kind"] == "odometry"]
     gaps = [abs(edge["source"] - edge["target"]) for edge in odometry]  # frames tried again lie before their targets
     gap = min(gaps, default=1)
@@ -113,9 +99,6 @@ def _sure_turns_deg(edges: Sequence[Mapping[str, Any]]) -> tuple[Array, float]:
     """Return the turns from one frame number to the next, of the least gap that occurs, that edges determine.
 
     An edge determines one whose heaviest mode leaves all others the probability at which a pose is called wrong.
-
-    Args:
-        edges: of the report.
 
     Returns:
         Rotation vectors (n, 3) in degrees, and the median of their standard deviations.
@@ -141,11 +124,7 @@ def _in_one_sense(turns: Array) -> bool:
 
 
 def estimated_focal_length(camera: Mapping[str, Any]) -> str:
-    """Return in words the focal length estimated from the graph's cycles, else "".
-
-    Args:
-        camera: as in report.json.
-    """
+    """Return in words the focal length estimated from the graph's cycles, else ""."""
     fx_px, factor, sigma = camera.get("fx_px"), camera.get("factor_in_run", 1.0), camera["focal_factor_sigma"]
     if fx_px is None or not camera.get("loops"):
         return ""
@@ -155,11 +134,7 @@ def estimated_focal_length(camera: Mapping[str, Any]) -> str:
 
 
 def contradicted_focal_length(camera: Mapping[str, Any]) -> str:
-    """Return in words that the estimated focal length contradicts the given one, with likely causes, else "".
-
-    Args:
-        camera: as in report.json.
-    """
+    """Return in words that the estimated focal length contradicts the given one, with likely causes, else ""."""
     if (sds := camera.get("given_sds", 0.0)) <= SIGMAS:
         return ""
     return (
@@ -197,9 +172,6 @@ def unchecked_focal_length(report: Mapping[str, Any]) -> str:
 
     For captures with a focal length 4 to 7 % too short, the sums of rotations over a turn were too short by 0.7 to 1.0
     times as much.
-
-    Args:
-        report: of the run.
     """
     turned_deg = sum(step_angles_deg(report["edges"]))
     if report["closed"] or not report["trustworthy"] or turned_deg < _FAR_DEG:
@@ -226,10 +198,6 @@ def remedies(report: Mapping[str, Any], prior: AbstractPrior) -> list[Remedy]:
     """Return what to do next about the first reason not to trust a model, and about its size if that is another.
 
     If all that speaks against it is that few frames are left out or contradict the others, it can do without them.
-
-    Args:
-        report: of the run.
-        prior: of the run.
     """
     # Wrong colours may cause others, lost frames follow them.
     urgency = {"colour_misaligned": 0, "left_out": 2}
@@ -387,9 +355,6 @@ def visible_frames(frames: Sequence[Mapping[str, Any]]) -> str:
     """Return in words which frames show the object if the first or the last ones do not, else "".
 
     If most masks are unsure, they may show a hand, and the other frames the object.
-
-    Args:
-        frames: of the report.
     """
     ids = sorted(frame["id"] for frame in frames)
     shown = [frame for frame in frames if frame.get("cause") != Outcome.TOO_FEW_POINTS.label]
