@@ -1,4 +1,8 @@
-"""Selection of the pairs of views to register besides consecutive ones, and of the registrations to accept."""
+"""Selection of the pairs of views to register besides consecutive ones, and of the registrations to accept.
+
+`map_view` is the map so far; `posteriors` are the registrations of one frame so far, against the previous view first,
+from which it is `steps` frames away.
+"""
 
 from __future__ import annotations
 
@@ -159,24 +163,13 @@ class Closer:
         return bool(angle_rad.min(initial=np.inf) >= np.radians(self.keyframe_deg))
 
     def relocalisation_target(self, posteriors: Sequence[Posterior], map_view: MapView) -> int | None:
-        """Return the earlier view to register a lost frame against next; None to give up.
-
-        Args:
-            posteriors: registrations of the frame so far, the previous view first.
-            map_view: the map so far.
-        """
+        """Return the earlier view to register a lost frame against next; None to give up."""
         if len(posteriors) > self.max_relocations:
             return None
         return self._relocaliser(map_view, self._usual(map_view)).next_target(posteriors)
 
     def placement(self, posteriors: Sequence[Posterior], map_view: MapView, *, steps: int = 1) -> Placement:
-        """Return the posterior that places a frame, and why: that of the previous view, or else of another.
-
-        Args:
-            posteriors: registrations of the frame, the previous view first.
-            map_view: the map so far.
-            steps: number of frames from the previous view to this one.
-        """
+        """Return the posterior that places a frame, and why: that of the previous view, or else of another."""
         return self._relocaliser(map_view, self._usual(map_view), steps=steps).placement(posteriors)
 
     def predicted_motion(self, base: Posterior, target: int, solution: Solution) -> PoseGaussian:
@@ -190,12 +183,6 @@ class Closer:
 
         Edges to views from which the object had turned away are closures; of the others, the one that places the frame,
         or was meant to, is odometry, and the rest are spans.
-
-        Args:
-            posteriors: registrations of one new frame, against the previous view first.
-            placement: of the frame.
-            map_view: the map so far.
-            steps: number of frames from the previous view to this one.
         """
         base = placement.base
         paths = map_view.shortest_paths(base.target) if base is not None and len(posteriors) > 1 else ShortestPaths()
@@ -276,11 +263,7 @@ class Relocaliser:
     """Number of frames from the previous view to this one."""
 
     def placement(self, posteriors: Sequence[Posterior]) -> Placement:
-        """Return the posterior that places a frame, and why.
-
-        Args:
-            posteriors: registrations of the frame, the previous view first.
-        """
+        """Return the posterior that places a frame, and why."""
         if not posteriors:
             return Placement()
         odometry = posteriors[0]
@@ -306,9 +289,6 @@ class Relocaliser:
 
         A single acceptable posterior needs confirmation by the view nearest to its pose. Otherwise the view nearest to
         the extrapolated motion comes first, then those farthest from all views tried.
-
-        Args:
-            posteriors: registrations of the frame so far, the previous view first.
         """
         tried = [posterior.target for posterior in posteriors]
         untried = [frame for frame in self.map_view.frames if frame not in tried]

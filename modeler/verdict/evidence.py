@@ -1,4 +1,8 @@
-"""Evidence for and against a model: values with the limits beyond which it is not trusted."""
+"""Evidence for and against a model: values with the limits beyond which it is not trusted.
+
+Views are by frame number; `edges` are those that take part, and `solution` has their poses. `tolerance_m` is the error
+of the surface above which a model is wrong; `distances` are those of `prior_distances`.
+"""
 
 from __future__ import annotations
 
@@ -135,9 +139,6 @@ def contradiction(distances: Sequence[tuple[Edge, float]]) -> tuple[Edge, Check]
 
     In standard deviations of a Gaussian prior in six dimensions: √(2 Δ), with Δ in nats from the prior's mode to the
     posterior's mean. Defined alike for other densities.
-
-    Args:
-        distances: as `prior_distances` returns them.
     """
     if not distances:
         return None
@@ -150,9 +151,6 @@ def prior_check(distances: Sequence[tuple[Edge, float]]) -> Check | None:
 
     A wrong step shows a little in every pair. Under a true prior, a posterior's mean is nearer to the mode than the
     motion, whose squared distance follows χ² with six degrees of freedom. None if nothing can be compared.
-
-    Args:
-        distances: as `prior_distances` returns them.
     """
     squared = [2.0 * nats for edge, nats in distances if edge.kind == "odometry"]
     if not squared:
@@ -167,10 +165,6 @@ def loop_check(errors: Sequence[LoopClosureError], tolerance_m: float = 0.0) -> 
     The NEES of a closure error follows χ² with six degrees of freedom. For the largest of several loops, the tail
     probability is at most their number times as large (Bonferroni). A closure error that would not make a pose wrong if
     it were that pose's is within the limit, however small its standard deviation.
-
-    Args:
-        errors: of all loops.
-        tolerance_m: error of the surface above which a model is wrong.
     """
     finite = [error for error in errors if np.isfinite(error.sigmas)]
     if not finite:
@@ -244,12 +238,6 @@ def other_modes(edges: Sequence[Edge], solution: Solution, views: Mapping[int, R
     """Return the probability that some pair is not at its heaviest mode, by the weights after the graph.
 
     Alternative alignments of segments count likewise. Modes that differ by less than the error limits are one.
-
-    Args:
-        edges: those that take part.
-        solution: the poses and the weights.
-        views: by frame number.
-        tolerance_m: error of the surface above which a model is wrong.
     """
     settled = 1.0
     for edge in edges:
@@ -321,11 +309,6 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
 
     A surface point of one frame is transformed into another, where it faces the camera. If the pixel and those around
     it measured something farther away by more than the tolerance, there is no surface: one of the two poses is wrong.
-
-    Args:
-        views: by frame number.
-        trajectory: object_from_camera (4, 4) by frame number.
-        tolerance_m: error of the surface above which a model is wrong.
     """
     frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
     frames = spread(frames, MAX_VIEWS)

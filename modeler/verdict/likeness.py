@@ -185,9 +185,6 @@ def print_check(pairs: Sequence[Likeness]) -> tuple[Likeness, Check] | None:
     Where print of the same contrast is on surface that matches, it agrees as well as in other pairs of the run, or one
     of the poses is wrong. Light and oblique sight lower a correlation now and then: it counts if no chain of pairs that
     agree joins the two frames; of pairs across segments, the one that agrees best counts. None if print agrees nowhere.
-
-    Args:
-        pairs: of a run.
     """
     printed = [pair for pair in pairs if pair.contrast >= _FAINT]  # NaN where it was not compared
     usual = float(np.quantile([pair.correlation for pair in printed], 0.75)) if printed else 0.0

@@ -1,4 +1,7 @@
-"""The uncertainty of a run's poses, of its model's size, and of the surface fused under these poses."""
+"""The uncertainty of a run's poses, of its model's size, and of the surface fused under these poses.
+
+`about_mean` is that of a run's solution, and `factor` is `misfit`, on standard deviations.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +50,7 @@ class Spread:
 
 
 def misfit(edges: Sequence[Edge], solution: Solution) -> float:
-    """Return the factor by which residuals of edges exceed their standard deviations, at least 1.
-
-    Args:
-        edges: those that take part.
-        solution: the poses.
-    """
+    """Return the factor by which residuals of edges exceed their standard deviations, at least 1."""
     fit = graph_check(edges, solution)
     return 1.0 if fit is None else float(np.sqrt(max(fit.value, 1.0)))
 
@@ -109,12 +107,7 @@ class AboutMean:
 
 
 def spread_of_rotations(about_mean: AboutMean, factor: float = 1.0) -> Spread | None:
-    """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose.
-
-    Args:
-        about_mean: of the solution.
-        factor: on the standard deviations: `misfit`.
-    """
+    """Return the largest uncertainty of a pose's rotation, in degrees; None without a pose."""
     sigmas_deg = {
         frame: float(np.degrees(one_axis_sd(factor**2 * covariance[:3, :3], WRONG_RAD)))
         for frame, covariance in about_mean.covariances.items()
