@@ -165,9 +165,6 @@ class SymmetryFinder:
         """Return ξ (k, 6) of turns by 1 rad under which shape and colours of a model stay, in the object frame.
 
         About the axis of a body of revolution, or about three axes through the centre of a ball.
-
-        Args:
-            model: with a mesh.
         """
         found = self.find_in(model, np.array([0.0, -1.0, 0.0]))
         return np.array([axis.turn for axis in (found.with_colour or found).continuous]).reshape(-1, 6)

@@ -228,14 +228,8 @@ class IncrementalSolver:
     ) -> IncrementalSolver:
         """Return the solver of a large graph condensed to the frames that new ones may be registered against.
 
-        It is the same if the graph is small or condensed, or if too many frames have loops.
-
-        Args:
-            tree: factors that are trusted.
-            loops: the others.
-            inlier: which of them take part.
-            poses: the solution.
-            root: the frame whose pose is the identity.
+        It is the same if the graph is small or condensed, or if too many frames have loops. `inlier` tells which loops
+        take part at the solution `poses`, of which that of the root is the identity.
         """
         if self.condensed is not None or len(poses) < CONDENSED_FROM:
             return self

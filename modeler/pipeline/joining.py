@@ -243,14 +243,7 @@ class Joiner:
     def between(
         self, target: Segment, source: Segment, pairs: Sequence[tuple[int, int]], target_from_source: Array
     ) -> tuple[Edge, ...]:
-        """Return edges, accepted or rejected, between pairs of views of two segments that are aligned roughly.
-
-        Args:
-            target: segment of the first views.
-            source: segment of the second.
-            pairs: numbers of the views.
-            target_from_source: (4, 4).
-        """
+        """Return edges, accepted or rejected, between pairs of views of two segments that are aligned roughly."""
         edges = []
         for t, s in pairs:
             views = self.ready(source.views[s]), self.ready(target.views[t])

@@ -109,10 +109,7 @@ class Run:
                 yield self._after(placed)
 
     def fill(self, frames: Iterable[Frame]) -> Iterator[Step | Searching]:
-        """Add frames that were skipped while tracking, each registered against the nearest in time; yield their steps.
-
-        Args:
-            frames: in order of time.
+        """Add frames that tracking skipped, in order of time, each registered against the nearest; yield their steps.
 
         Raises:
             InputError: if two frames have the same number.

@@ -140,11 +140,6 @@ def change_at_rim(depths_m: Sequence[Float32Array], camera: Camera, noise: Depth
 
     Most is all but what a near object leaves free there, and no less than that of the whole rim: before nothing, an arm
     that holds the object is all that the rim shows.
-
-    Args:
-        depths_m: (n of (h, w), NaN = no measurement) of a camera that may stand still.
-        camera: the camera.
-        noise: what is expected of it.
     """
     spreads, pixels = _spreads_at_rim(depths_m, camera, noise)
     least = max((1.0 - _FREE_RIM) * len(spreads), _FREE_RIM * pixels)
@@ -152,13 +147,7 @@ def change_at_rim(depths_m: Sequence[Float32Array], camera: Camera, noise: Depth
 
 
 def noise_over_frames(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
-    """Return the ratio of the depth's spread over frames to `noise`, the median at the image's rim; 1 if not known.
-
-    Args:
-        depths_m: (n of (h, w), NaN = no measurement) of a camera that stands still.
-        camera: the camera.
-        noise: what is expected of it.
-    """
+    """Return the ratio of the depth's spread over frames to `noise`, the median at the image's rim; 1 if not known."""
     spreads, _ = _spreads_at_rim(depths_m, camera, noise)
     return float(np.median(spreads)) if len(spreads) and len(depths_m) > _FEW_FRAMES else 1.0
 
@@ -177,11 +166,6 @@ def noise_within(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthN
     """Return the ratio of the depth's noise within single images to `noise`: the median over all pixels.
 
     Second differences along rows are free of planes; those of pixels some way apart, of noise that neighbours share.
-
-    Args:
-        depths_m: (n of (h, w), NaN = no measurement).
-        camera: the camera.
-        noise: what is expected of it.
     """
     stride, ratios = planning_stride(camera), []
     for whole_m in depths_m:

@@ -121,12 +121,7 @@ class CandidateFinder:
         return Things(frame, points, off, np.array(scenery).reshape(-1, 4), self.noise)
 
     def masks(self, things: Things, renderer: ModelRenderer) -> list[BoolArray]:
-        """Return masks (h, w), the likeliest first.
-
-        Args:
-            things: of a frame.
-            renderer: of the model.
-        """
+        """Return masks (h, w), the likeliest first."""
         width_m, points = 2.0 * renderer.radius_m, things.points
         labels = pieces(things.frame.depth_m, things.off)
         counts = np.bincount(labels.ravel())

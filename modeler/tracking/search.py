@@ -229,11 +229,7 @@ def log_odds(pair: PairLikelihood, fine_m: float) -> float:
 
     The likelihood counts 0 where surface matches as well as in a true pose, and here where nothing was measured, as in
     the shadows of what hides the object. Of other surface, each patch matches by chance alone, in one of the poses of
-    the search (method, eq. 15.1).
-
-    Args:
-        pair: frame and model.
-        fine_m: least noise of matching surface.
+    the search (method, eq. 15.1). The noise of matching surface is at least `fine_m`.
     """
     pose, here = np.eye(4), se3.rows(np.eye(4))
     noise_m = max(pair.noises_m(pose, fine_m)[0], fine_m)
@@ -245,10 +241,7 @@ def log_odds(pair: PairLikelihood, fine_m: float) -> float:
 def relative_weights(pairs: Sequence[PairLikelihood], view: RayImage, fine_m: float) -> Array:
     """Return relative weights (k,) of poses: those of Gaussians about the means, under the noise of the best match.
 
-    Args:
-        pairs: frame and model, rendered in each of the poses.
-        view: the frame.
-        fine_m: least noise of matching surface.
+    Each pair is of the view and the model, rendered in one of the poses; the noise is at least `fine_m`.
     """
     here = np.eye(4)
     blur_m = max(min(pair.noises_m(here, fine_m)[0] for pair in pairs), fine_m)

@@ -160,13 +160,7 @@ def _shares(matching: Array, normals: Array) -> tuple[float, float]:
 
 
 def _print(compared: Comparison, first: int, second: int) -> tuple[float, float]:
-    """Return the correlation of print on surface of two views, and its variance in the view with less; or NaN.
-
-    Args:
-        compared: the views with colour.
-        first: frame number of one.
-        second: of the other.
-    """
+    """Return the correlation of print on surface of two views, and its variance in the view with less; or NaN."""
     pair = Pair.of(compared.views, compared.trajectory, first, second)
     if len(pair.points_m) < MIN_SHARED:
         return np.nan, np.nan
