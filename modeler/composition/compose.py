@@ -213,9 +213,6 @@ def prior_name(options: PriorOptions, sequence: AbstractSequence | None) -> str:
     return kind if fits and kind in enough and enough[kind]() else otherwise
 
 
-_TURN_DEG = 180.0  # no table turns farther from frame to frame
-
-
 def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[str, str]:
     """Return the name of the prior, and in words the assumptions not given by an option.
 
@@ -230,7 +227,7 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
         assumed.append(f"step {step_deg:g}°, from sequence.json")
     step_deg = step_deg if options.step_deg is None else options.step_deg
     apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
-    if "turntable" in name.split("+") and step_deg is not None and apart > 1 and apart * abs(step_deg) > _TURN_DEG:
+    if "turntable" in name.split("+") and step_deg is not None and apart > 1 and apart * abs(step_deg) > 180.0:
         raise InputError(
             f"`step_deg` {step_deg:g} is from one frame number to the next, and these go up by {apart}, as angles in "
             f"names do: frames would be {apart * step_deg:g}° apart; if the names are angles, give `step_deg` 1"

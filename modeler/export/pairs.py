@@ -29,7 +29,7 @@ from modeler.types import (
     ViewPair,
 )
 
-_CHECK_BYTES = 16
+_CHECK_BYTES = 16  # with which damage goes unnoticed once in 2¹²⁸
 _GAUSSIAN = ("mean", "covariance", "by_focal")  # its arrays
 _digests: WeakKeyDictionary[RayImage, bytes] = WeakKeyDictionary()  # of views, each part of several keys
 

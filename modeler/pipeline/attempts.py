@@ -45,7 +45,7 @@ from modeler.verdict.evidence import distance_nats
 _LIMIT_OUTCOMES = (Outcome.AT_LIMIT, Outcome.NO_OVERLAP, Outcome.DEGENERATE)  # possible for motions beyond the limits
 _MIN_OVERLAP_GAIN = 0.15  # similar sides have about the same overlap; the true mode has more than one at the limits
 _UNEVEN_SHARE = 0.25
-"""Of the way: standard deviation in the middle between two views, if the speed is uneven (anywhere between: 0.29)."""
+"""Of the way: sd in the middle between two views, if the speed is uneven (0.29 if it is anywhere)."""
 
 
 @dataclass(frozen=True, eq=False)

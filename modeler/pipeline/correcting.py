@@ -62,7 +62,8 @@ Measured: with 0.01, 0.02 and 0.04, masks of a drawn capture have 0.985, 0.984 a
 common.
 """
 _CELLS: Final = 2**20  # along each axis, of which a scene fills a hundred
-_OVERRULED_BY: Final = 0.25  # by which the other views have to be margin than the view itself: cubes at a rim hold both
+_OVERRULED_BY: Final = 0.25
+"""Share beyond a half with which other views overrule the view itself: cubes at a rim hold both."""
 _APART: Final = 2.5  # cubes, a seventh of the object's radius, between parts of one thing
 
 Cubes = npt.NDArray[np.int64]

@@ -77,7 +77,7 @@ class FeatureMatcher:
     """Largest number of matches; those whose features differ least stay."""
     partners: int = 12
     """Matches that fix a motion together with the one in whose company they are."""
-    min_points: int = 30  # halved or doubled, pairs of six sequences are the same
+    min_points: int = 30
     """Fewest points of each surface after thinning; with fewer there are no motions."""
 
     def motions(self, source: RayImage, target: RayImage) -> tuple[Array, npt.NDArray[np.int64]]:

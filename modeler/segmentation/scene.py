@@ -39,12 +39,12 @@ from modeler.segmentation.planes import (
     surroundings,
     upright,
 )
+from modeler.significance import QUORUM
 from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
 from modeler.views.range_noise import RangeNoise
 
 _NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
 RIVAL = 0.3  # ratio of the score of what else may be the object from which it is ambiguous: 0.4 chooses of two alike
-_TOUCHING_PX = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ def _moving_object(layers: Layers, allowed: BoolArray) -> tuple[BoolArray, bool]
     depth = layers.front_m[..., 2]
     labels = pieces(depth, layers.moved & allowed)
     merit = _central(labels, depth, layers.front_share)
-    cut = np.bincount(labels[edge_of(np.isfinite(depth))], minlength=len(merit)) >= _TOUCHING_PX
+    cut = np.bincount(labels[edge_of(np.isfinite(depth))], minlength=len(merit)) >= QUORUM
     merit[cut] *= STRAY_WEIGHT
     if merit.max() <= 0.0:
         return np.zeros_like(layers.moved), True
@@ -250,7 +250,7 @@ def _scenery(layers: Layers, found: BoolArray, planes: Array, support: Array | N
         around &= np.abs(over_m) > tolerance_m
         rim[np.abs(heights(rim, support)) < noise.tolerance_m(rim[:, 2])] = np.nan
     labels = pieces(back, above)
-    outside = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1) >= _TOUCHING_PX
+    outside = np.bincount(labels[edge_of(np.isfinite(back))], minlength=int(labels.max()) + 1) >= QUORUM
     outside[0] = False
     depth = np.where(outside[labels], back, np.float32(np.inf))
     for plane, goes_on in zip(planes, _beyond_image(planes, rim, noise), strict=True):

@@ -64,7 +64,7 @@ UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _STEP_SIGMA_RAD, _STEP_SIGMA = 0.06, 0.1
 """Of a prediction from the frames before: at 15 a second, speeds change by 50° and 1.5 sizes a second."""
-_OVERLAP = 0.6  # least, with any rotation
+_OVERLAP = 0.6  # least, with any rotation: rendered impostors have less
 _BEYOND_DOUBT = 30.0
 """Nats from which no other place is searched: twice what a wrong one reached in 87 scenes. Of as many against them, no
 place is tried but the likeliest: in 144 scenes the right one had -29 or more."""

@@ -230,9 +230,9 @@ the first Kinect's 2 mm at 0.7 m, where the captures that this was settled with 
 class SensorNoise(NamedTuple):
     """Noise of a depth camera in ray coordinates (paper, section II); the defaults are the first Kinect's."""
 
-    sigma_wh: float = 0.002
+    sigma_wh: float = 0.002  # as in the paper
     """Lateral noise in (w, h)."""
-    sigma_r_m: float | None = 0.002
+    sigma_r_m: float | None = 0.002  # as in the paper
     """Noise along the ray in m, for a surface that faces the camera; None = unknown."""
     sigma_colour_px: float = COLOUR_SHIFT_PX
     """Shift of colours beside depth from one image to the next, in px: they are aligned so well at best, and may be

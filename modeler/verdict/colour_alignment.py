@@ -16,6 +16,7 @@ from scipy import linalg, ndimage
 
 from modeler import se3
 from modeler.registration.visibility import VisibilityLikelihood
+from modeler.registration.visibility.photometric import MAX_CORRELATION
 from modeler.types import FLIPS, Array, ColourAlignment
 from modeler.verdict.colour_fit import (
     AT_LEAST,
@@ -33,7 +34,6 @@ from modeler.views import Sensor
 _REACH_SDS: Final = 2.0  # of the prior: colour of another camera is as far off as is searched, 15 to 50 mm aside
 _STEPS: Final = 4  # in each band: from a few px off, the last one moves it by less than 0.1 sd
 _APART_PX: Final = 0.25  # of places whose difference is a derivative: on planes, it is nearly linear
-_MAX_CORRELATION: Final = 0.99  # as in registration
 _SMALL: Final = 1e-9 * np.eye(3)  # information of no importance
 _FAINTEST: Final = 1e-6  # standard deviation of a feature, of images without any
 
@@ -151,7 +151,7 @@ def _of_pair(
     features = own - share * still
     features /= features[:, :1].std(axis=2, keepdims=True)
     values = features[:, 0] - features[:, 0].mean(axis=1, keepdims=True)
-    correlation = float(np.clip(np.mean(values[0] * values[1]), 0.0, _MAX_CORRELATION))
+    correlation = float(np.clip(np.mean(values[0] * values[1]), 0.0, MAX_CORRELATION))
     if correlation == 0.0:
         return nothing
     patches = one.patches_px * known.sum() / (4.0 * np.pi * width_px**2)

@@ -20,7 +20,8 @@ _TILES_PX: Final = (48, 24)  # the first size with enough tiles: 24 px hold half
 _MIN_TILES: Final = 10  # of a size; 5 or 20 give the same on captures
 WIDENED_PX: Final = 8  # by which depth cameras widen an outline at most: a D415 with hole filling by up to 8 px of 640
 _FRAMES: Final = 4  # more are redundant
-_NOT_PLANE: Final = 4.0  # times the median of the tiles' variances
+_NOT_PLANE: Final = 4.0
+"""Times the median of the tiles' variances, which noise of some twenty independent pixels does not reach."""
 _BALL_PX: Final = 6  # side of the squares over which errors are averaged, as by the smoothing of surface
 
 

@@ -33,9 +33,9 @@ from modeler.types import Array, RayImage
 _ROUNDING_M = 1e-6  # of depths in single precision: planes without noise may match exactly
 MIN_MATCHES = 20
 """Fewer matches, or points, do not determine the nuisance parameters: of 20, a variance has a relative standard
-deviation of 0.3."""
+deviation of 0.3. With 10 or 40, pairs of six sequences are the same to 0.1 %."""
 DESCENT_STRIDE = 4
-"""Every fourth point is used for descent."""
+"""Every fourth point is used for descent; with every second or eighth, pairs of six sequences are as good."""
 
 
 class Scores(NamedTuple):

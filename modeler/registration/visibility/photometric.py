@@ -36,8 +36,10 @@ _LEVEL = 1.0 / 255.0  # smallest change of a bright colour's logarithm in 8 bits
 _CACHE: WeakKeyDictionary[RayImage, np.ndarray] = WeakKeyDictionary()  # of `view_features`
 
 ASSUMED_RHO = 0.7
-"""Correlation assumed in descent."""
-_MAX_CORRELATION = 0.99
+"""Correlation assumed in descent, as print has on captures (0.7 to 0.8); with 0.35 or 0.85, pairs of six sequences are
+as good."""
+MAX_CORRELATION = 0.99
+"""Largest correlation that is assumed: of images without noise, weights would be infinite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +225,7 @@ def without_shift(equations: Array, shifts: Array) -> Array:
 
 def weight_of(correlation: float) -> float:
     """Return the weight of squared differences of features of unit variance (method, eq. 7.4)."""
-    square = float(np.clip(correlation, 0.0, _MAX_CORRELATION)) ** 2
+    square = float(np.clip(correlation, 0.0, MAX_CORRELATION)) ** 2
     return square / (1.0 - square)
 
 
