@@ -22,7 +22,9 @@ IntArray = npt.NDArray[np.int64]
 
 OWN_RIM = 9  # column of `point_rows`: the weight in the view of the points
 _SILHOUETTE_NOISE = 0.5  # error of a silhouette as a fraction of its pixels' lateral noise, which is independent
-_RAMP = 0.25  # width of the ramps of f and g below and above the cosine from which on ranges are reliable
+_RAMP = 0.25
+"""Width of the ramps of f and g below and above the cosine from which on ranges are reliable; with 0.125 and 0.5, 11
+pairs are off by 0.156° and 0.186° in the median, with 0.25 by 0.151°."""
 _RELIABLE = Sensor.min_cosine
 _COSINES = np.array([_RELIABLE - _RAMP, _RELIABLE, _RELIABLE, _RELIABLE + _RAMP], dtype=np.float32)  # see `Projection`
 # Share of unmeasured pixels near the object above which a camera measures steep surface instead of filling holes, which

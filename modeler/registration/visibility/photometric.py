@@ -22,7 +22,7 @@ from modeler.types import Array, Frame, RayImage
 FINEST_PX = 0.6
 """Standard deviation of the finest band's Gaussian in px: below it, pixels and noise dominate."""
 BANDS = 6
-"""Number of bands, each twice as wide as the previous one."""
+"""Number of bands, each twice as wide as the previous one; with 3 or 12, pairs of six sequences are as good."""
 
 VALUE, BY_COLUMN, BY_ROW = range(3)
 """Of a band at a surface point: the feature, and its derivatives by column and row in 1/px."""

@@ -18,7 +18,7 @@ from modeler.registration.visibility.likelihood import PairLikelihood
 from modeler.types import AbstractPoseDensity, Array, BoolArray, PoseGaussian
 
 _STRIDE = 2  # every second point is used for scores; with every fourth, NEES/6 of hard pairs is 2.3 for 1.5
-_COARSE_STRIDE = 8  # where the best pose need only be roughly right
+_COARSE_STRIDE = 8  # where the best pose need only be roughly right; with 4 or 16, pairs of six sequences are as good
 _OPEN = 0.5  # sd in basins from which on prior and surface leave a motion open: descents reach no farther
 SEPARATE_RAD = 0.25
 """Rotation between different modes: wider than a basin of attraction (`Search.basin`), in which descents end at one."""
