@@ -108,7 +108,7 @@ def judged(closer: Closer, posteriors: Sequence[Posterior], map_view: MapView, *
     return closer.judge(posteriors, closer.placement(posteriors, map_view, steps=steps), map_view, steps=steps)
 
 
-def witnessed(posterior: Posterior, nats: float) -> Posterior:
+def weighed(posterior: Posterior, nats: float) -> Posterior:
     return replace(posterior, log_marginal_likelihood=nats)
 
 
@@ -117,6 +117,6 @@ def stated(source: int, *, scatter: float = 4.0, wrong: float = -90.0) -> Callab
 
     def given(posterior: Posterior) -> Posterior:
         doubtful = posterior.source == source and posterior.source - posterior.target > 1
-        return witnessed(posterior, wrong if doubtful else scatter * float(np.sin(3.0 * posterior.source)) - 20.0)
+        return weighed(posterior, wrong if doubtful else scatter * float(np.sin(3.0 * posterior.source)) - 20.0)
 
     return given

@@ -121,7 +121,7 @@ def test_starts_with_the_centroids_together_where_the_prior_is_general(pair: Pai
     assert np.linalg.norm(carried - target.centroid_m) < 0.004
 
 
-def test_starts_at_the_centre_of_a_prior_that_knows_the_motion(pair: Pair, rng: np.random.Generator) -> None:
+def test_starts_at_the_centre_of_a_narrow_prior(pair: Pair, rng: np.random.Generator) -> None:
     source, target = pair
     truth = POSES[1] @ se3.inverse(POSES[0])
     initial = start(source, target, Normal(truth, source.centroid_m, 0.02, 0.003), rng)

@@ -303,7 +303,7 @@ def test_an_engine_that_does_not_come_back_is_said(cli: Run, tmp_path: Path, mon
 
 
 def test_clocks_of_machines_may_differ(cli: Run, tmp_path: Path) -> None:
-    """What is done is told by contents; times are those of whatever machine wrote a file."""
+    """What is done follows from contents; times are those of whatever machine wrote a file."""
     folders, out = [sequence(tmp_path / name) for name in "ab"], tmp_path / "out"
     assert cli("batch", *folders, "--out", out).status == 0
     before = book(out)

@@ -340,7 +340,7 @@ def test_a_turn_that_is_given_by_hand_counts_more(frames: slice, given_deg: floa
         assert comes_back(open_sequence(BOX).select(frames=frames), prior, reach_deg=20.0) is expected
 
 
-def test_a_table_that_turns_the_other_way_is_asked_about() -> None:
+def test_a_table_that_turns_the_other_way_is_doubted() -> None:
     lost = {"frames": [{"cause": ""}, {"cause": Outcome.NO_OVERLAP.label}], "reason_codes": ["left_out"]}
     known, unknown = (priors.TurntablePrior(-25.0, 3.0, step_sign=sign) for sign in ("known", "unknown"))
     assert sign_is_ambiguous(lost, known)

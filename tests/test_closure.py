@@ -15,7 +15,7 @@ from closure_runs import (
     stated,
     turned,
     view,
-    witnessed,
+    weighed,
 )
 
 from modeler import se3
@@ -250,7 +250,7 @@ def test_closure_that_the_images_contradict_is_refused_though_it_agrees() -> Non
 
 
 def test_scattered_or_missing_evidence_rejects_nothing() -> None:
-    for spoil in (stated(13, scatter=15.0), lambda posterior: witnessed(posterior, np.nan)):
+    for spoil in (stated(13, scatter=15.0), lambda posterior: weighed(posterior, np.nan)):
         run = Run(list(REGULAR_DEG)).run(Closer(), spoil)
         assert all(edge.accepted for edge in run.judged[13])
 
@@ -311,7 +311,7 @@ def test_once_all_frames_are_in_each_is_tried_over_two_steps() -> None:
         edge = Closer().judge_span(wrong, run.map_view)
         assert not edge.accepted
         assert isinstance(edge.reason, Consistency)
-        assert Closer().judge_span(witnessed(true, -1e9), run.map_view).accepted
+        assert Closer().judge_span(weighed(true, -1e9), run.map_view).accepted
 
 
 def test_views_that_failed_to_join_the_previous_one_are_tried_again_once_the_graph_predicts_their_motion() -> None:
@@ -398,7 +398,7 @@ def test_what_leaves_a_turn_open_places_frames_and_tells_nothing_more(sigma_deg:
         (12.0, 20.0, False),
     ],
 )
-def test_a_turn_may_be_open_where_the_graph_knows_it_better(
+def test_a_turn_may_be_open_where_the_graph_determines_it_better(
     chain_deg: float, span_deg: float, *, takes_part: bool
 ) -> None:
     run, closer = Run(list(REGULAR_DEG)), Closer()
@@ -407,7 +407,7 @@ def test_a_turn_may_be_open_where_the_graph_knows_it_better(
     assert span.accepted is takes_part
 
 
-def test_a_view_that_never_determined_the_rotation_promises_little() -> None:
+def test_a_view_that_never_determined_the_rotation_adds_little() -> None:
     """The object comes back to views some of which left the turn open, and to others that did not."""
 
     def first_open(posterior: Posterior) -> Posterior:
@@ -431,18 +431,18 @@ def test_vaguest_of_several_modes_tells_whether_a_turn_is_open() -> None:
     assert isinstance(closer.judge_span(vague, run.map_view).reason, OpenRotation)
 
 
-# Frames that nothing places, and the first one after them: what is believed of its registrations.
+# Frames that nothing places, and the first one after them: what is accepted of its registrations.
 
 
-def test_previous_view_is_not_believed_after_lost_frames_where_the_images_contradict_it() -> None:
+def test_registration_against_the_previous_view_is_rejected_after_lost_frames_where_the_images_contradict_it() -> None:
     run = Run(list(REGULAR_DEG[:9])).run(Closer(), stated(-1))
     truth, solution = run.measured(4, 8, np.random.default_rng(0), np.zeros(6)), run.solution  # as far as four steps
-    doubtful = witnessed(replace(truth, source=12, target=8), -90.0)
+    doubtful = weighed(replace(truth, source=12, target=8), -90.0)
     map_view = MapView(run.views, solution, run.graph.edges)
     assert Closer().placement([doubtful], map_view, steps=1).base is doubtful
     assert Closer().placement([doubtful], map_view, steps=4).base is None
     assert isinstance(judged(Closer(), [doubtful], map_view, steps=4)[0].reason, LowLikelihood)
-    assert Closer().placement([witnessed(doubtful, -30.0)], map_view, steps=4).base is not None
+    assert Closer().placement([weighed(doubtful, -30.0)], map_view, steps=4).base is not None
 
 
 @pytest.mark.parametrize("lost", [1, 16])
@@ -460,15 +460,15 @@ def test_lost_frames_are_found_again_from_any_earlier_view(lost: int) -> None:
     back = 9 + lost
     assert not any(edge.accepted for frame in gone for edge in run.judged[frame])
     assert len(run.tried[back]) <= 1 + Closer().max_relocations
-    if lost == 1:  # so far from where it was, so soon, is not believed
+    if lost == 1:  # so far from where it was, so soon, is not accepted
         assert not any(edge.accepted for edge in run.judged[back])
     else:
         np.testing.assert_allclose(run.solution.trajectory[back], run.truth[back], atol=0.02)
-        assert sum(edge.accepted for edge in run.judged[back]) >= 2  # a witness
+        assert sum(edge.accepted for edge in run.judged[back]) >= 2  # a confirmation
         assert run.judged[back][0].kind == "odometry"  # that failed, though the object had turned away
 
 
-def test_after_lost_frames_the_previous_view_is_believed_only_near_where_the_motion_led() -> None:
+def test_after_lost_frames_the_previous_view_is_accepted_only_near_where_the_motion_led() -> None:
     """A box looks the same from behind: after a gap its other side matches the last view."""
     run = Run([*(23.0 * np.arange(7)), *[0.0] * 4, 253.0])
 
@@ -483,29 +483,29 @@ def test_after_lost_frames_the_previous_view_is_believed_only_near_where_the_mot
     assert not any(edge.accepted for edge in run.judged[11])
 
 
-@pytest.mark.parametrize(("outcome", "witnesses"), [("converged", ()), ("converged", (5,)), ("ambiguous", (5,))])
-def test_far_from_where_the_motion_led_the_previous_view_is_believed_only_with_a_witness(
-    outcome: str, witnesses: tuple[int, ...]
+@pytest.mark.parametrize(("outcome", "confirmations"), [("converged", ()), ("converged", (5,)), ("ambiguous", (5,))])
+def test_far_from_where_the_motion_led_the_previous_view_is_accepted_only_with_a_confirmation(
+    outcome: str, confirmations: tuple[int, ...]
 ) -> None:
     """A box's broad side matches its narrow one, a quarter turn away: by itself such a match says nothing."""
     run = Run([*(20.0 * np.arange(7)), *[0.0] * 4, 140.0])
 
     def spoil(posterior: Posterior) -> Posterior:
         gone = 6 < posterior.source < 11
-        if gone or (posterior.source == 11 and posterior.target not in (6, *witnesses)):
+        if gone or (posterior.source == 11 and posterior.target not in (6, *confirmations)):
             return replace(posterior, outcome=Outcome.NO_OVERLAP)
         vague = posterior.source == 11 and posterior.target == 6 and outcome == "ambiguous"
         return replace(posterior, outcome=Outcome.AMBIGUOUS) if vague else posterior
 
     run.run(Closer(), spoil)
-    believed = outcome == "converged" and bool(witnesses)  # what is vague agrees with anything
-    assert [edge.accepted for edge in run.judged[11]].count(True) == (2 if believed else 0)
-    if believed:
+    accepted = outcome == "converged" and bool(confirmations)  # what is vague agrees with anything
+    assert [edge.accepted for edge in run.judged[11]].count(True) == (2 if accepted else 0)
+    if accepted:
         assert run.tried[11][:2] == (6, 5)  # the nearest to where the previous view puts it
         assert run.judged[11][0].reason == JoinsPrevious(Outcome.CONVERGED, 0.8, ConfirmedBy(5))
 
 
-def test_a_view_seen_from_far_round_places_a_frame_only_with_a_witness() -> None:
+def test_a_view_seen_from_far_round_places_a_frame_only_with_a_confirmation() -> None:
     run = Run([*(20.0 * np.arange(9)), *[0.0] * 6, 300.0, 320.0])
 
     def spoil(posterior: Posterior) -> Posterior:

@@ -73,10 +73,10 @@ def test_systematic_error_grows_with_the_length_of_the_path() -> None:
     map_view, run = chain([20.0 * k for k in range(6)])
     model, base = ConsistencyModel(drift_deg=2.0), posterior_of(6, 5, run.truth_between(4, 5))
     posterior = posterior_of(6, 2, se3.inverse(turned(40.0)) @ turned(121.0))
-    foretold = composed(base.pose, map_view.solution.relative_gaussian(2, 5))
+    predicted = composed(base.pose, map_view.solution.relative_gaussian(2, 5))
     found = model.consistency_through(base, posterior, map_view, map_view.shortest_paths(5))
     centroid_m = se3.transform(se3.inverse(base.pose.mean), CENTROID_M[None])[0]
-    over_four = model.consistency(posterior, [(1.0, foretold)], length=4, centroid_m=centroid_m)  # 6, 5, 4, 3, 2
+    over_four = model.consistency(posterior, [(1.0, predicted)], length=4, centroid_m=centroid_m)  # 6, 5, 4, 3, 2
     assert found.distance == pytest.approx(over_four.distance)
     assert found.angle_deg == pytest.approx(1.0, abs=0.8)
 

@@ -92,7 +92,7 @@ def test_a_trial_is_what_register_gives_of_the_pair(method: AbstractRegistrar, a
         assert found.seconds == (0.5 if assumed and isinstance(method, ContradictedWithin) else 0.25)
 
 
-def test_tries_every_pair_by_every_method_and_knows_how_many() -> None:
+def test_tries_every_pair_by_every_method_and_counts_them() -> None:
     trials = list(experiment().trials(Recording()))
     assert len(trials) == experiment().size(Recording()) == 10
     assert [(t.method, t.offset, t.source, t.target) for t in trials[:3]] == [

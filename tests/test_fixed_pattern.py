@@ -82,10 +82,10 @@ def registered(share: float, seed: int) -> tuple[Posterior, float]:
 
 def test_balls_that_carry_the_cameras_pattern_do_not_seem_to_stand_still() -> None:
     seeds = range(6)
-    believed = [registered(0.0, seed) for seed in seeds]
-    assert all(posterior.usable for posterior, _ in believed)
+    without = [registered(0.0, seed) for seed in seeds]
+    assert all(posterior.usable for posterior, _ in without)
     degrees_of_freedom = 3 * len(seeds)
-    assert sum(wrong for _, wrong in believed) > chi2.ppf(0.99, degrees_of_freedom)  # 1 in 100 of true covariances
+    assert sum(wrong for _, wrong in without) > chi2.ppf(0.99, degrees_of_freedom)  # 1 in 100 of true covariances
     given = [registered(1.0, seed) for seed in seeds]
     assert sum(right for _, right in given) < chi2.ppf(0.5, degrees_of_freedom)
     for posterior, _ in given:

@@ -105,7 +105,7 @@ def test_the_derivative_is_exact_and_what_it_does_not_tell_widens_the_posterior(
     np.testing.assert_allclose(np.diag(covariance) / want, 1.0, atol=0.4)
 
 
-def test_a_prior_that_knows_the_motion_keeps_it_under_every_focal_length(rng: np.random.Generator) -> None:
+def test_a_narrow_prior_keeps_its_motion_under_every_focal_length(rng: np.random.Generator) -> None:
     class Exact(Free):
         def log_prior(self, target_from_source: Array) -> Array:
             return gaussian(ABOUT, 0.1 * SIGMAS).log_density(target_from_source)
@@ -188,8 +188,8 @@ def test_a_loop_tells_the_focal_length_and_the_poses_under_it(rng: np.random.Gen
         np.testing.assert_allclose(pose, se3.inverse(truth[0]) @ truth[frame], atol=1e-6)
 
 
-@pytest.mark.parametrize(("sigma", "believed"), [(0.004, True), (0.019, False)])
-def test_a_mean_far_from_the_prior_is_believed_only_where_loops_tell_it(sigma: float, believed: bool) -> None:
+@pytest.mark.parametrize(("sigma", "accepted"), [(0.004, True), (0.019, False)])
+def test_a_mean_far_from_the_prior_is_accepted_only_where_loops_determine_it(sigma: float, accepted: bool) -> None:
     """Rounds of registration that each move it on, as a wrong edge makes them."""
 
     def estimate_at(log_factor: float) -> FocalLength:
@@ -197,8 +197,8 @@ def test_a_mean_far_from_the_prior_is_believed_only_where_loops_tell_it(sigma: f
         return FocalLength(step, sigma, prior_sigma=0.02, loops=1, sigmas_before=3.0, sigmas_after=2.0, by_focal={})
 
     found = estimate_focal_length(estimate_at, reach=0.1)
-    assert (found.log_factor > 0.08, found.determined_by) == ((True, "loop") if believed else (False, "prior"))
-    if not believed:
+    assert (found.log_factor > 0.08, found.determined_by) == ((True, "loop") if accepted else (False, "prior"))
+    if not accepted:
         assert (found.log_factor, found.sigma) == (0.0, 0.02)
 
 

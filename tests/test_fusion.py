@@ -330,7 +330,7 @@ def test_the_voxels_follow_the_pixels_and_stay_within_their_number(ball):
 # What is known of each vertex, and of colours.
 
 
-def test_a_vertex_knows_who_saw_it_and_how_far_off_it_may_be(rng):
+def test_a_vertex_has_its_views_and_standard_deviation(rng):
     model = fused(BRICK, rng=rng)
     assert model.vertex_sigmas_m is not None
     assert np.array_equal(model.vertex_views == 0, ~np.isfinite(model.vertex_sigmas_m))

@@ -58,7 +58,7 @@ def test_views_of_all_blocks_are_counted_and_averaged(monkeypatch: pytest.Monkey
     np.testing.assert_allclose(other.weight, one.weight, rtol=0.05)
     np.testing.assert_allclose(other.sigmas_m, one.sigmas_m, rtol=0.1)
     off = np.abs(one.colours.astype(int) - other.colours).max(axis=1)
-    assert np.mean(off <= 4) > 0.99  # highlights are told by the median of the views of a block
+    assert np.mean(off <= 4) > 0.99  # highlights are found by the median of the views of a block
 
 
 def test_blocks_that_cannot_be_written_stay_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def cards(
     return survey(open_sequence(folder))
 
 
-def test_aligned_colour_is_believed(tmp_path: Path) -> None:
+def test_aligned_colour_is_accepted(tmp_path: Path) -> None:
     assert cards(tmp_path / "s").misaligned is None
 
 

@@ -307,7 +307,7 @@ def test_wherever_the_centre_of_friction_lies_the_contact_goes_with_the_finger()
 
 
 @pytest.mark.parametrize(("index", "goes_on"), [(3, True), (5, True), (6, False), (12, False)])
-def test_the_pace_is_not_believed_for_long(index: int, goes_on: bool) -> None:
+def test_the_pace_is_not_used_for_long(index: int, goes_on: bool) -> None:
     prior = VelocityPrior(TablePrior(175.0, 0.2)).learned(solution(HERE, 3), ())
     assert isinstance(prior.between(at(index), at(2)), DefensiveMixture) == goes_on
 

@@ -141,6 +141,6 @@ def test_views_of_a_noisy_camera_overlap_where_they_fit() -> None:
         pair = VisibilityLikelihood().between(views[1], views[0], np.random.default_rng(0))
         truth = poses[0] @ se3.inverse(poses[1])
         shared[given] = pair.overlap(truth), pair.overlap(se3.translation(np.array([0.0, 0.0, 0.03])) @ truth)
-    (untold, _), (stated_right, stated_wrong) = shared.values()
-    assert untold < 0.5 < stated_right
+    (unstated, _), (stated_right, stated_wrong) = shared.values()
+    assert unstated < 0.5 < stated_right
     assert stated_wrong < 0.5

@@ -65,8 +65,8 @@ def test_frames_without_a_pose_say_nothing(rng):
     np.testing.assert_array_equal(only, masks[0])  # nothing to compare it with
 
 
-def test_an_arm_larger_than_the_object_is_told_from_it_by_how_far_both_turn():
-    # Of seeds 0 to 4, 0 leaves masks that depend on rounding, and 1 an arm that cannot be told.
+def test_an_arm_larger_than_the_object_is_distinguished_by_how_far_both_turn():
+    # Of seeds 0 to 4, 0 leaves masks that depend on rounding, and 1 an arm that cannot be distinguished.
     frames, _, masks, poses = held(6, np.random.default_rng(2), wall=False, arm=0.06)
     assert abs(turned_deg(poses) - 5 * STEP_DEG) < 1e-6
     modeler = Modeler()

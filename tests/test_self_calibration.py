@@ -77,7 +77,7 @@ def test_a_step_that_cannot_be_registered_again_stays_part_of_its_loop() -> None
     assert abs(0.93 * found.factor - 1.0) < 0.01
 
 
-def test_what_surface_does_not_determine_is_not_foretold_to_move_far() -> None:
+def test_what_surface_does_not_determine_is_not_predicted_to_move_far() -> None:
     """Of steps of a box of which two faces are seen: where it slides along them, the images hold its silhouette."""
     views, edges = seen(0.93)
     for edge in edges:

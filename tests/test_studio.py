@@ -295,7 +295,7 @@ def test_views_are_taken_from_a_camera_when_wanted(tmp_path: Path) -> None:
     assert view.camera.fx == pytest.approx(seen.camera.fx)
 
 
-def test_a_camera_that_is_not_there_is_told_and_nothing_is_begun(tmp_path: Path) -> None:
+def test_a_camera_that_is_not_there_is_reported_and_nothing_is_begun(tmp_path: Path) -> None:
     studio = Studio(tmp_path / "studio")
     with pytest.raises(InputError, match=r"realsense|pyrealsense2"):
         studio.record("realsense:", None, None)
@@ -456,7 +456,7 @@ def test_a_server_that_is_interrupted_ends_in_order(scene: Path, tmp_path: Path)
     assert json.loads((tmp_path / "studio" / "box" / "scan.json").read_text())["sequence"] == str(scene)
 
 
-def test_wrong_use_is_told_in_a_line(refusal: Callable[..., str], tmp_path: Path, scene: Path) -> None:
+def test_wrong_use_is_reported_in_a_line(refusal: Callable[..., str], tmp_path: Path, scene: Path) -> None:
     out = ("--out", tmp_path / "studio")
     assert "no such folder" in refusal("studio", tmp_path / "none", *out)
     assert "only read" in refusal("studio", scene, "--out", scene / "studio")

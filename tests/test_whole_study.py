@@ -96,7 +96,7 @@ def test_depth_is_that_of_the_mesh_in_its_true_pose(camera: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("camera", "told", "intrinsics", "sensor"),
+    ("camera", "kind_given", "intrinsics", "sensor"),
     [
         ("time of flight", True, "nominal", (0.02, 0.1)),
         ("time of flight", True, "device", (0.005, 0.1)),
@@ -105,10 +105,10 @@ def test_depth_is_that_of_the_mesh_in_its_true_pose(camera: str) -> None:
         ("stereo", True, "exact", None),
     ],
 )
-def test_a_camera_is_told_as_far_as_it_was_drawn(
-    camera: str, told: bool, intrinsics: str, sensor: tuple[float, float] | None
+def test_a_camera_is_stated_as_far_as_it_was_drawn(
+    camera: str, kind_given: bool, intrinsics: str, sensor: tuple[float, float] | None
 ) -> None:
-    drawn = replace(_drawn(1)[0], camera=camera, kind_told=told, intrinsics=intrinsics)
+    drawn = replace(_drawn(1)[0], camera=camera, kind_told=kind_given, intrinsics=intrinsics)
     found = Capture(drawn, 0, THINGS, PICTURES).sensor()
     assert (None if found is None else (found.sigma_focal, found.sigma_multipath)) == sensor
 

@@ -225,7 +225,7 @@ class Tracker:
             return 1
         seen_px = float(np.hypot(np.ptp(rows), np.ptp(columns)))
         model_px = 2.0 * self.renderer.radius_m * frame.camera.fx / float(np.median(frame.depth_m[rows, columns]))
-        # Half of it may be hidden; more is not believed, as the model may be in another unit.
+        # Half of it may be hidden; more is not assumed, as the model may be in another unit.
         return max(round(min(model_px, 2.0 * seen_px) / FINE_PX), 1)
 
     def _followed(self, view: RayImage, rng: np.random.Generator) -> Tracked | None:
