@@ -53,7 +53,8 @@ class Outcome(enum.Enum):
     )
     TOO_FEW_POINTS = (
         "too few points",
-        "The object covers too few pixels; check the mask, the region of interest and the largest depth.",
+        "The object covers too few pixels, or noise and holes leave too little of it; check the mask, the region of "
+        "interest and the largest depth.",
     )
     UNSURE_MASK = (
         "unsure mask",

@@ -24,7 +24,10 @@ _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond
 _MOST_OUTLIERS: Final = 0.25  # of the frames: three agree for each that does not (by hand)
 _FAR_DEG: Final = 100.0  # 1 % of this rotation is 1°, a third of a wrong pose
 _BY_OPTIONS: Final = {
-    Outcome.TOO_FEW_POINTS: "The object covers too few pixels; check the mask, `roi` and `max_depth_m`.",
+    Outcome.TOO_FEW_POINTS: (
+        "The object covers too few pixels, or noise and holes leave too little of it; check the mask, `roi` and "
+        "`max_depth_m`."
+    ),
     Outcome.UNSURE_MASK: (
         "The object is hard to segment; give `roi`, `max_depth_m`, or masks that hold only the object."
     ),
