@@ -22,6 +22,7 @@ if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # as nohup starts what it
 import numpy as np
 import pytest
 from command_runner import QUICK, Run, refusal_of, runner
+from hypothesis import settings
 from turning_box import COUNT, LOST, steps
 
 from modeler.cli import main
@@ -32,6 +33,8 @@ from modeler.system import processes
 from modeler.types import Frame, Step
 from studies.formats.image_folders import WRITERS, small_frames, small_truth, write_bundlesdf, write_open3d, write_tum
 
+settings.register_profile("tests", deadline=None)  # however loaded the machine is
+settings.load_profile("tests")
 survey: Any = sys.modules["modeler.sequences.survey"]  # the module, whose name in its package is its function's
 
 

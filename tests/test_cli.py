@@ -75,6 +75,7 @@ def report(folder: Path) -> dict:
         (("build", "SCENE", "--out", "OUT", "--every", "0"), "--every 0"),
         (("build", "SCENE", "--out", "OUT", "--frames", "1-3"), "--frames '1-3'"),
         (("build", "SCENE", "--out", "OUT", "--frames", "50:60"), "0 to 2"),
+        (("build", "SCENE", "--out", "OUT", "--frames", "0:" + "9" * 5000), "--frames"),
         (("build", "SCENE", "--out", "OUT", "--seed", "-1"), "--seed: "),
         (("build", "SCENE", "--out", "OUT", "--prior", "table", "--max-offset-m", "1"), "--max-offset-m"),
         (("build", "SCENE", "--out", "OUT", "--prior", "table+table"), "names table twice"),
@@ -111,6 +112,8 @@ def report(folder: Path) -> dict:
         (("evaluate", "SCENE", "--out", "OUT", "--roi", "0", "120", "9", "125"), "--roi 0 120 9 125"),
         (("render", "nothing", "--out", "OUT"), "box"),
         (("view", "NOWHERE"), "NOWHERE"),
+        (("info", str(TUBE.parent)), "box, flashlight, tube"),
+        (("convert", "SCENE", "--out", "OUT.txt"), "is not a run folder"),
         (("export", "NOWHERE", "--out", "OUT.glb"), "NOWHERE"),
         (("export", "SCENE", "--out", "OUT.glb"), "no report"),
     ],
@@ -118,7 +121,7 @@ def report(folder: Path) -> dict:
 def test_unusable_input_gives_status_2_and_one_line(
     refusal: Callable[..., str], scene: Path, tmp_path: Path, arguments: tuple[str, ...], says: str
 ) -> None:
-    places = {name: tmp_path / name for name in ("OUT", "OUT.glb", "NOWHERE")} | {"SCENE": scene}
+    places = {name: tmp_path / name for name in ("OUT", "OUT.glb", "OUT.txt", "NOWHERE")} | {"SCENE": scene}
     assert says in refusal(*(places.get(argument, argument) for argument in arguments))
     assert list(tmp_path.iterdir()) == []
 

@@ -292,10 +292,6 @@ def test_paths_longer_than_the_system_takes_are_refused(words: str, refusal: Cal
     refusal(*({"LONG": long, "BOX": BOX}.get(word, word) for word in words.split()))
 
 
-def test_numbers_of_thousands_of_digits_are_refused(refusal: Callable[..., str], tmp_path: Path) -> None:
-    refusal("build", BOX, "--out", tmp_path / "run", "--frames", "0:" + "9" * 5000)
-
-
 ENDINGS = [
     (signal.SIGINT, KeyboardInterrupt, None),
     (signal.SIGTERM, SystemExit, 143),

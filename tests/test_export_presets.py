@@ -347,11 +347,18 @@ def _check_bop(out: Path, built: Path) -> None:
         (("--for", "urdf", "--out", "a", "--mass-kg", "0"), "out of range"),
         (("--for", "urdf", "--out", "a", "--mass-kg", "1", "--density-kg-m3", "1"), "give one of them"),
         (("--out", "a.ply", "--mass-kg", "1"), "go with --for mujoco"),
+        (("--texture", "--out", "a.stl"), "--texture goes with"),
+        (("--bop", "--out", "a.obj"), "BOP models are PLY files"),
+        (("--tint", "views", "--out", "a.stl"), "STL carries no colour"),
+        (("--triangles", "2", "--out", "a.stl"), "--triangles 2 is too few"),
+        (("--voxel-m", "-1", "--out", "a.stl"), "--voxel-m -1 is out of range"),
+        (("--texture", "--tint", "views", "--out", "a.glb"), "give one of them"),
+        (("--watertight", "--sequence", "nowhere", "--out", "a.stl"), "give its new place with --sequence"),
     ],
 )
-def test_presets_that_cannot_be_are_said_in_one_line(
+def test_exports_that_cannot_be_are_said_in_one_line(
     refusal: Callable[..., str], built: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
 ) -> None:
-    given = [tmp_path / word if word in ("a", "a.stl", "a.ply") else word for word in arguments]
+    given = [tmp_path / word if word.partition(".")[0] == "a" else word for word in arguments]
     assert words in refusal("export", built, *given)
     assert not list(tmp_path.iterdir())

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from modeler.cli import main
 from modeler.export import RunFolder
-from modeler.sequences import AbstractSequence, KeptSequence, bundled, frame_range, open_sequence, write_bop
+from modeler.sequences import AbstractSequence, KeptSequence, frame_range, open_sequence
 from modeler.types import Frame, InputError
 from studies.formats.image_folders import write_tum
 from studies.formats.ros_bags import Recorder
@@ -104,15 +104,6 @@ def test_poses_are_not_interpolated_over_gaps(
     assert tuple(poses) == (1, 2, 3)
 
 
-def test_a_sequence_has_no_poses_to_convert(
-    tmp_path: Path, frames: list[Frame], capfd: pytest.CaptureFixture[str]
-) -> None:
-    write_bop(tmp_path / "scene", frames[:1], depth_scale_mm=1.0)
-    assert main(["convert", str(tmp_path / "scene"), "--out", str(tmp_path / "poses.txt")]) == 2
-    assert "is not a run folder" in capfd.readouterr().err
-    assert not (tmp_path / "poses.txt").exists()
-
-
 def test_poses_of_a_run_go_to_bop(built: Path, tmp_path: Path, refusal: Callable[..., str]) -> None:
     poses = {str(pose["id"]): pose["object_from_camera"] for pose in RunFolder(built).report()["poses"]}
     assert main(["convert", str(built), "--out", str(tmp_path / "scene_gt.json")]) == 0
@@ -139,11 +130,6 @@ def test_a_model_is_built_from_any_of_them(tmp_path: Path, frames: list[Frame]) 
     assert [frame["outcome"] for frame in report["frames"]] == ["accepted"] * 4
     assert main(["convert", str(run), "--out", str(tmp_path / "scene_gt.json")]) == 0
     assert set(json.loads((tmp_path / "scene_gt.json").read_text())) == {"0", "1", "2", "3"}
-
-
-def test_the_bundled_sequences_are_found_in_their_folder(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(bundled("box").parent)]) == 2
-    assert "box, flashlight, tube" in capsys.readouterr().err
 
 
 # Frames are selected by number, as slices are.

@@ -214,26 +214,6 @@ def test_a_textured_export_shows_the_colours(runs: Runs, tmp_path: Path) -> None
     assert 0.05 < (green > 30.0).mean() < 0.5  # the head
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--texture", "--out", "a.stl"], "--texture goes with"),
-        (["--bop", "--out", "a.obj"], "BOP models are PLY files"),
-        (["--tint", "views", "--out", "a.stl"], "STL carries no colour"),
-        (["--triangles", "2", "--out", "a.stl"], "--triangles 2 is too few"),
-        (["--voxel-m", "-1", "--out", "a.stl"], "--voxel-m -1 is out of range"),
-        (["--texture", "--tint", "views", "--out", "a.glb"], "give one of them"),
-        (["--watertight", "--sequence", "nowhere", "--out", "a.stl"], "give its new place with --sequence"),
-    ],
-)
-def test_exports_that_cannot_be_are_said_in_one_line(
-    runs: Runs, tmp_path: Path, refusal: Callable[..., str], arguments: list[str], words: str
-) -> None:
-    given = [tmp_path / word if word.startswith("a.") else word for word in arguments]
-    assert words in refusal("export", runs.upright, *given)
-    assert not list(tmp_path.iterdir())
-
-
 def volume_of(body: tabletop.Body, object_from_model: Array, change: Callable[[Array], Array]) -> Any:
     poses = [change(pose) for pose in tabletop.turntable(8)]
     return Fuser(voxel_m=0.004).volume(tabletop.views(body, poses), tabletop.trajectory(poses, object_from_model))

@@ -71,7 +71,7 @@ def test_masks_that_most_frames_are_unsure_of_stay_unsure(going_round, monkeypat
     frames, _ = going_round
     segment = Segmenter.segment
     scene = Segmenter().scene(frames)
-    for few in (range(2), range(6)):
+    for few in (range(1), range(3)):
         monkeypatch.setattr(
             Segmenter,
             "segment",
@@ -79,9 +79,9 @@ def test_masks_that_most_frames_are_unsure_of_stay_unsure(going_round, monkeypat
                 segment(self, frame, scene), outcome=Outcome.UNSURE_MASK if frame.index in few else Outcome.CONVERGED
             ),
         )
-        *_, last = modeler.Modeler().run(frames, scene)
+        *_, last = modeler.Modeler().run(frames[:4], scene)
         assert isinstance(last, Step)
-        assert ("unsure_masks" in [fault.code for fault in last.verdict.shortcomings]) == (len(few) > 4)
+        assert ("unsure_masks" in [fault.code for fault in last.verdict.shortcomings]) == (len(few) > 2)
 
 
 def true_and_wrong():

@@ -26,7 +26,7 @@ def scaled_noise(scale: float) -> DepthNoise:
 def built() -> dict[float, list[Step]]:
     sequence = open_sequence(bundled("box"))
     noise = sequence.sensor()
-    frames = [sequence.frame(index) for index in sequence.indices[:4]]
+    frames = [sequence.frame(index) for index in sequence.indices[:3]]
     runs = {}
     for scale in (1.0, *SCALES):
         modeler = Modeler(sensor=Sensor(noise._replace(sigma_r_m=None)), prior=GeneralPrior(limits_assumed=True))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from modeler import se3
 
-LAWS = settings(deadline=None, derandomize=True, max_examples=100)
+LAWS = settings(derandomize=True, max_examples=100)
 
 # Angles at which a formula may lose its digits: zero, the switch to the series, half a turn.
 ANGLES_RAD = st.one_of(

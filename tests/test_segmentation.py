@@ -558,13 +558,12 @@ def test_rendered_sequences_without_their_masks(name):
 )
 def test_real_sequences(name, pixels, object_px):
     """Sizes and places are those of masks that were looked at, frame by frame."""
-    frames = [frame for frame in BopSequence(REAL / name)]
-    segmenter = Segmenter()
-    picks = np.unique(np.linspace(0, len(frames) - 1, 12).round().astype(int))
-    scene = segmenter.scene([frames[k] for k in picks])
+    sequence, segmenter = BopSequence(REAL / name), Segmenter()
+    picks = np.unique(np.linspace(0, len(sequence) - 1, 12).round().astype(int))
+    scene = segmenter.scene([sequence.frame(sequence.indices[k]) for k in picks])
     assert scene.plane is not None
-    for frame in frames[::4]:
-        one = segmenter.segment(frame, scene)
+    for index in sequence.indices[::4]:
+        one = segmenter.segment(sequence.frame(index), scene)
         assert one.outcome is Outcome.CONVERGED
         assert pixels[0] < np.count_nonzero(one.mask) < pixels[1]
         assert np.abs(np.argwhere(one.mask).mean(axis=0)[::-1] - object_px).max() < 60.0
