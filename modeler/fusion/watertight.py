@@ -13,7 +13,6 @@ from modeler.fusion.meshing import COARSE_VOXELS, FAINT, DistanceField
 from modeler.kernels import occupancy
 from modeler.types import Array, BoolArray
 
-# All chosen by hand.
 ROUNDS = 400  # of the primal-dual iteration; with 200, the closed box has 0.3 % less volume, with 800 the same
 SEAM = 4  # passes over the seam between seen and unseen surface, and rings next to it that are smoothed like weak ones
 OUTVOTED = 0.1

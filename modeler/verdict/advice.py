@@ -21,7 +21,7 @@ _ROUGH: Final = (
     0.25  # of a step: relative deviation of steps when an object is turned by hand (11° to 37° where 18° were intended)
 )
 _NEAR_LIMIT_DEG: Final = 15.0  # from the limit: the search follows poses beyond it so far (docs/method/search.md)
-_MOST_OUTLIERS: Final = 0.25  # of the frames: three agree for each that does not (by hand)
+_MOST_OUTLIERS: Final = 0.25  # of the frames: three agree for each that does not
 _FAR_DEG: Final = 100.0  # 1 % of this rotation is 1°, a third of a wrong pose
 _BY_OPTIONS: Final = {
     Outcome.TOO_FEW_POINTS: (
