@@ -146,17 +146,17 @@ def outcome(shape: str, holder: Holder, given: Given = "masks") -> Outcome:
     """Build the model of one run and compare it with the truth."""
     recorded = Recorded(stage(shape, holder, given))
     modeler = compose.modeler(recorded, recorded.stage.options, MethodOptions(seed=0), ObjectOptions())
-    given: AbstractSequence = recorded
+    sequence: AbstractSequence = recorded
     if holder != "person":
         times_s = np.array([recorded.frame(index).time_s for index in recorded.indices])
         regrasped = REGRASPED if holder == "robot" else ROBOT_FRAMES
         poses = HandPoses(times_s, hand_poses(recorded, regrasped))
         modeler = replace(modeler, prior=HeldPrior(poses))
         if given == "shape":
-            given = HandMarkedSequence(recorded, hand_shape(recorded), poses)
+            sequence = HandMarkedSequence(recorded, hand_shape(recorded), poses)
     hidden = _hidden(recorded)
     began = time.perf_counter()
-    *_, last = modeler.run(given, compose.scene(modeler, given))
+    *_, last = modeler.run(sequence, compose.scene(modeler, sequence))
     assert isinstance(last, Step)
     assert last.verdict is not None
     seconds = time.perf_counter() - began

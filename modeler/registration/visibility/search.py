@@ -84,7 +84,8 @@ class Search:
     basin: float = 0.2
     """Extent of a basin of attraction: rotation in rad, translation as a fraction of the object's size."""
     per_basin: float = 3.0
-    """Number of starts per basin in the prior."""
+    """Number of starts per basin in the prior; with 1.5 and 6, 11 pairs are off by 0.20° and 0.17° in the median, with
+    3 by 0.15°."""
     min_starts: int = 60
     """Least number of starts; with a limit of 60 a basin in place of 3, as many pairs fail, and they take 1.7 times as
     long."""
