@@ -30,11 +30,15 @@ from modeler.types import Array, BoolArray, Camera, Float32Array, Frame, Plane
 Window = tuple[slice, slice]
 _ZONE_MARGIN_SHARE = 0.3
 """Share of the zone's size, if that is more; with 0.15 and 0.6, masks have an IoU of 0.999 with these."""
-_ZONE_MARGIN = 0.14  # distance from the object's zone at which it may still be, as a share of its distance
+_ZONE_MARGIN = 0.14
+"""Distance from the object's zone at which it may still be, as a share of its distance; halved or doubled, masks of a
+plant have an IoU of 0.94 and 0.93 with these, others of 0.999 and more."""
 _FLATTEST_SLOPE = 0.3  # least ratio of height noise to depth noise: supports are not exactly planar
 _MOVED = 0.028  # of an object's outline between the frames from which its scene is learned, as a share of its distance
 _GAP_FLOORS = 15.0  # least gap in noise floors, 12 mm: nearby, the parts of a plush toy are as far apart
-_CREASE = 0.014  # creases of the support are at most so high, and so far from the object, as a share of its distance
+_CREASE = 0.014
+"""Creases of the support are at most so high, and so far from the object, as a share of its distance; halved or
+doubled, masks of a plant have an IoU of 0.99 and 0.94 with these, others of 0.997 and more."""
 AREA_FACTOR = 2.5
 """Factor by which the visible area may leave its range in the scene; with 1.25 a plant's mask is unsure, with 5
 none."""

@@ -25,13 +25,22 @@ _MAX_HYPOTHESES = 200  # cells that are tried, evenly: one of a plane of `LEAST_
 _MOST_PLANES = 10  # at most, of a scene; without the limit, masks of the airplane have an IoU of 0.995 with these
 LEAST_SHARE: Final = 0.006
 """Share of an image that a dominant plane covers at least."""
-_UPRIGHT = 0.2  # least upward (-y) component of the normal of a plane that faces up: walls lean by less than 12°
-_SAME_DIRECTION = np.cos(np.radians(20.0))  # between the normals of a cell and its plane
+_UPRIGHT = 0.2
+"""Least upward (-y) component of the normal of a plane that faces up: walls lean by less than 12°. Halved or doubled,
+masks of four captures are the same."""
+_SAME_DIRECTION = np.cos(np.radians(20.0))
+"""Between the normals of a cell and its plane; with 10 or 40°, masks of a plant have an IoU of 0.993 and more with
+these."""
 _LEVEL = np.cos(np.radians(2.0))
 """Planes that tilt by less are kept level; without, masks of cap have an IoU of 0.993 with these."""
-_LEVEL_BONUS = 1.5  # factor on the votes for level planes
-_PARALLEL = np.cos(np.radians(6.0))  # between the normals of parallel planes, given the accuracy of small ones
-_REACH_SIZES = 1.5  # radius of an object's surroundings, in sizes of the object
+_LEVEL_BONUS = 1.5
+"""Factor on the votes for level planes; at 0.75, masks of a plant have an IoU of 0.90 with these, at 3 1.00."""
+_PARALLEL = np.cos(np.radians(6.0))
+"""Between the normals of parallel planes, given the accuracy of small ones; with 3 or 12°, masks of four captures are
+the same."""
+_REACH_SIZES = 1.5
+"""Radius of an object's surroundings, in sizes of the object; with half, five of a plant's six frames have another
+outcome, with twice masks have an IoU of 0.995 and more with these."""
 _MAX_GROUND = 6000  # points; more do not help, since their errors are correlated
 
 

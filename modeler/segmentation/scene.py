@@ -43,7 +43,9 @@ from modeler.significance import QUORUM
 from modeler.types import Array, BoolArray, Camera, Float32Array, Plane
 from modeler.views.range_noise import RangeNoise
 
-_NEIGHBOUR_SIZES = 0.5  # distance, in sizes of the largest moving piece, within which its other parts move
+_NEIGHBOUR_SIZES = 0.5
+"""Distance, in sizes of the largest moving piece, within which its other parts move; with 0.25 and 1, masks of a plant
+have an IoU of 0.89 and 0.95 with these, of cap and two more 1.00."""
 RIVAL = 0.3  # ratio of the score of what else may be the object from which it is ambiguous: 0.4 chooses of two alike
 
 

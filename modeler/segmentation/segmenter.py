@@ -35,7 +35,7 @@ _CHANGES = 2.0
 """Largest ratio of the spread from frame to frame to the noise within frames at the image's rim, where this is at least
 the expected one: noise of a camera that stands still is the same in both to its fixed pattern, which only lowers it."""
 _LEAST_NOISE = 0.4  # of the expected noise: edges change by more than a rim; with 0.2, masks are as good
-_PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover
+_PLANE_SHARE = 0.02  # share of a masked object's surroundings that a support plane must cover: some three `LEAST_SHARE`
 _LOOSE_SHARE = 0.15  # share of a mask on the support plane, beyond the rim of any object
 _REACH = 3.0  # radii of a mask about its middle: with 2, frames with other masks share less; whole images dilute it
 
