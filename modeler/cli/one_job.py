@@ -47,9 +47,8 @@ def begin(words: str) -> tuple[Job, dict[str, Any]]:
     if now in ("changed", "other"):
         from modeler.export import RunFolder, locked
 
-        resumes = (
-            now == "changed" and RunFolder(job.run).is_sound
-        )  # frames that have not changed need not be registered
+        # Frames that have not changed need not be registered.
+        resumes = now == "changed" and RunFolder(job.run).is_sound
         with locked(job.run):
             RunFolder.open(job.run, overwrite=not resumes, resume=resumes)
     note = {
