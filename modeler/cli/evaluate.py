@@ -279,7 +279,7 @@ def _truth(run: Path, parts: Sequence[Part]) -> tuple[dict[int, Array], Mesh]:
 def _models_table(scores: Sequence[ModelScore]) -> list[tuple[str, ...]]:
     """Return heading and rows of a table of scores."""
     heading = ("model", "poses", "over", "frames", "max deg", "accuracy mm", "completeness mm", "F 3 mm", "F 5 mm")
-    lines = [heading]
+    lines: list[tuple[str, ...]] = [heading]
     for score in scores:
         lengths = (f"{value:.2f}" for value in (score.rotation_error_deg, score.accuracy_mm, score.completeness_mm))
         shares = f"{score.f_3mm:.3f}", f"{score.f_5mm:.3f}"
