@@ -45,7 +45,8 @@ def say(words: str, level: int = logging.INFO, show: Callable[[str], object] | N
     if MESSAGES.note(line, level):
         try:
             (show or partial(print, file=sys.stderr))(f"modeler: {line}")
-        except (OSError, ValueError):  # ValueError: stderr is closed. Results do not depend on messages, now and later
+        except (OSError, ValueError):  # ValueError: stderr is closed
+            # This message and later ones are lost: results do not depend on them.
             with contextlib.suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 

@@ -227,6 +227,7 @@ def resolved_prior(options: PriorOptions, sequence: AbstractSequence) -> tuple[s
         assumed.append(f"step {step_deg:g}°, from sequence.json")
     step_deg = step_deg if options.step_deg is None else options.step_deg
     apart = min((late - early for early, late in itertools.pairwise(sequence.indices)), default=1)
+    # No table turns by more than half a turn from frame to frame.
     if "turntable" in name.split("+") and step_deg is not None and apart > 1 and apart * abs(step_deg) > 180.0:
         raise InputError(
             f"`step_deg` {step_deg:g} is from one frame number to the next, and these go up by {apart}, as angles in "

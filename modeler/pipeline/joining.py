@@ -243,7 +243,14 @@ class Joiner:
     def between(
         self, target: Segment, source: Segment, pairs: Sequence[tuple[int, int]], target_from_source: Array
     ) -> tuple[Edge, ...]:
-        """Return edges, accepted or rejected, between pairs of views of two segments that are aligned roughly."""
+        """Return edges, accepted or rejected, between pairs of views of two segments that are aligned roughly.
+
+        Args:
+            target: segment of the first views.
+            source: segment of the second.
+            pairs: frame numbers of the views.
+            target_from_source: (4, 4) the rough alignment.
+        """
         edges = []
         for t, s in pairs:
             views = self.ready(source.views[s]), self.ready(target.views[t])

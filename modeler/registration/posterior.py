@@ -136,7 +136,11 @@ def displacement(arms_m: Array, normals: Array, size_m: float) -> Array:
 
 
 def of_multipath(view: RayImage) -> Array:
-    """Return the covariance (6, 6) of ξ in target_from_source · Exp(ξ) due to smooth errors of depth of both views."""
+    """Return the covariance (6, 6) of ξ in target_from_source · Exp(ξ) due to smooth errors of depth of both views.
+
+    Args:
+        view: the source.
+    """
     if view.sigma_multipath == 0.0 or not len(view.points_m):
         return np.zeros((6, 6))
     about = _DIFFERS * view.multipath_m**2 * displacement(view.points_m - view.centroid_m, view.normals, view.size_m)

@@ -1,4 +1,7 @@
-"""Depth images: their noise, their points, what moves between them, and their connected pieces."""
+"""Depth images: their noise, their points, what moves between them, and their connected pieces.
+
+`depths_m` are n images (h, w) in m of one camera, NaN where nothing was measured; `noise` is what is expected of it.
+"""
 
 from __future__ import annotations
 
@@ -148,7 +151,10 @@ def change_at_rim(depths_m: Sequence[Float32Array], camera: Camera, noise: Depth
 
 
 def noise_over_frames(depths_m: Sequence[Float32Array], camera: Camera, noise: DepthNoise) -> float:
-    """Return the ratio of the depth's spread over frames to `noise`, the median at the image's rim; 1 if not known."""
+    """Return the ratio of the depth's spread over frames to `noise`, the median at the image's rim; 1 if not known.
+
+    The camera stands still.
+    """
     spreads, _ = _spreads_at_rim(depths_m, camera, noise)
     return float(np.median(spreads)) if len(spreads) and len(depths_m) > _FEW_FRAMES else 1.0
 

@@ -124,7 +124,12 @@ def free_directions(symmetries: Symmetries, *, coloured: bool) -> Array:
 
 
 def likeliest(placed: Sequence[tuple[float, Tracked]], renderer: ModelRenderer) -> Tracked:
-    """Return the likeliest of places or poses of one object, with their log odds; in doubt if others are as likely."""
+    """Return the likeliest of some places or poses of one object in a frame, in doubt if others are about as likely.
+
+    Args:
+        placed: with the log odds (nats) of each.
+        renderer: of the model.
+    """
     most, best = max(placed, key=lambda one: one[0])
     for odds, other in placed:
         if other is best or odds < most + np.log(DOUBT):

@@ -309,6 +309,11 @@ def free_space(views: Mapping[int, RayImage], trajectory: Mapping[int, Array], t
 
     A surface point of one frame is transformed into another, where it faces the camera. If the pixel and those around
     it measured something farther away by more than the tolerance, there is no surface: one of the two poses is wrong.
+
+    Args:
+        views: by frame number.
+        trajectory: object_from_camera (4, 4) by frame number.
+        tolerance_m: error of the surface above which a model is wrong.
     """
     frames = [frame for frame in sorted(views) if frame in trajectory and len(views[frame].points_m)]
     frames = spread(frames, MAX_VIEWS)
