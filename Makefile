@@ -1,6 +1,6 @@
 # make demo       model the bundled box sequence into runs/demo: one to two minutes the first time, nearly all of it setup, then 10 s
 # make setup      prepare .venv for all commands (one to two minutes more, quick if that is done)
-# make test       the whole gate: format, lint, types, layers, tests (ten minutes on two cores; installs the extra dev)
+# make test       the whole gate: format, lint, types, layers, tests (a quarter of an hour on two cores; installs the extra dev)
 # make test-slow  the slow tests, which make test leaves out
 # make docs       the guide as a site: build/site/index.html (installs the extra docs; warnings are errors)
 # make results    the tables of docs/ and the figures of README.md, from the files of studies/results
