@@ -13,7 +13,7 @@ from modeler.types import InputError
 from studies.fuzz.mutate import mutated, with_sums
 from studies.fuzz.targets import TARGETS, fresh, tiny, truth
 
-INPUTS = 12
+INPUTS = 20
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
